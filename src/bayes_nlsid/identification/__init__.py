@@ -1,0 +1,1 @@
+"""The residual of Eq. 13, its bounds, the fit, and forward-backward selection."""

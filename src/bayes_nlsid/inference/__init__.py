@@ -1,0 +1,1 @@
+"""Priors, likelihood, sampling and its convergence."""

@@ -1,0 +1,1 @@
+"""Where simulation and recordings differ, what was left out, and whether adding it helps."""

@@ -1,0 +1,1 @@
+"""What a posterior says about responses: backbone bands and held-out records."""

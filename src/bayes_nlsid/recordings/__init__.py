@@ -1,0 +1,1 @@
+"""Test runs in SI units: reading, checking, integrating, and the backbone of a decay."""

@@ -1,0 +1,1 @@
+"""Time integration of the modal model with its elements, batched over samples."""

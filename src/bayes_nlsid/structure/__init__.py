@@ -1,0 +1,1 @@
+"""The linear side: finite elements, reduction, identified modes, updating, virtual sensing."""

@@ -1,0 +1,1 @@
+"""Study files and case folders, the stage store, figures and the report."""
