@@ -116,7 +116,7 @@ class Recording:
     @property
     def time(self) -> NDArray[np.float64]:
         """(n,) s from the first sample."""
-        return self.dt * np.arange(self.n)
+        return np.asarray(self.dt * np.arange(self.n), dtype=float)
 
     @property
     def free(self) -> bool:
