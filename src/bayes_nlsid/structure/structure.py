@@ -186,15 +186,13 @@ def modes(structure: Structure, count: int = 10) -> Modes:
 
 def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
     """Modes of a pair of matrices that is already known to be symmetric, M positive definite, K positive semi-definite."""
+    from scipy.linalg import eigh
+
     n = K.shape[0]
     if n <= DENSE_LIMIT or count + 6 >= n - 1:
-        from scipy.linalg import eigh
-
         # Turned round, M x = μ (K − σM) x with μ = 1/(λ − σ): stiff joint springs then cannot drown the low modes in rounding.
         wanted, sigma = min(n, count + 7), shift(K, M)
-        inverted, vectors = eigh(dense(M), dense(K - sigma * M), subset_by_index=[n - wanted, n - 1])
-        vectors = vectors[:, ::-1] / np.sqrt(inverted[::-1])
-        values = 1 / inverted[::-1] + sigma
+        _, vectors = eigh(dense(M), dense(K - sigma * M), subset_by_index=[n - wanted, n - 1])
     else:
         from scipy.sparse.linalg import LinearOperator, eigsh
 
@@ -203,9 +201,11 @@ def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
         inverse = LinearOperator((n, n), matvec=factor, dtype=float)
         # A fixed start vector makes Lanczos, and with it every file this project writes, the same on every run.
         start = np.random.default_rng(0).standard_normal(n)
-        values, vectors = eigsh(K, k=count + 7, M=M, sigma=sigma, OPinv=inverse, v0=start)
-        order = np.argsort(values)
-        values, vectors = values[order], vectors[:, order]
+        _, vectors = eigsh(K, k=count + 7, M=M, sigma=sigma, OPinv=inverse, v0=start)
+    # So near to zero a shift mixes traces of the rigid-body modes into the others; one Rayleigh-Ritz step parts them again.
+    vectors = vectors / np.sqrt(np.einsum("ij,ij->j", vectors, M @ vectors))
+    values, mixing = eigh(vectors.T @ (K @ vectors), vectors.T @ (M @ vectors))
+    vectors = vectors @ mixing
     rigid = rigid_count(values, rounding(K, M))
     elastic = slice(rigid, min(rigid + count, len(values)))
     return Modes(vectors[:, :rigid], np.sqrt(np.maximum(values[elastic], 0.0)), vectors[:, elastic])
