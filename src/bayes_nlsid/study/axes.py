@@ -1,0 +1,65 @@
+"""What every figure shares apart from matplotlib: SI prefixes, unit signs, short names of parameters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+_PREFIXES = ((1e-9, "n"), (1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"), (1e9, "G"))
+_PREFIXABLE = ("m", "s", "N", "V", "Hz", "N/m", "m/s", "N s/m", "N m/rad", "J")
+_RAISED = str.maketrans("0123456789-.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻·")
+
+
+def unit_sign(unit: str) -> str:
+    """A unit as people write it: ``N/m^3`` → ``N/m³``."""
+    return re.sub(r"\^(-?[\d.]+)", lambda m: m.group(1).translate(_RAISED), unit)
+
+
+def prefixed(values: ArrayLike, unit: str) -> tuple[float, str]:
+    """A factor and a unit such that ``factor * values`` reads well, e.g. (1e3, "mm").
+
+    Parameters
+    ----------
+    values : array_like
+        The largest finite magnitude decides.
+    unit : str
+        SI unit; compound units whose prefix would be ambiguous stay as they are.
+    """
+    array = np.abs(np.asarray(values, dtype=float))
+    finite = array[np.isfinite(array)]
+    largest = float(finite.max()) if finite.size else 0.0
+    if unit not in _PREFIXABLE or largest == 0.0:
+        return 1.0, unit_sign(unit)
+    best = max((entry for entry in _PREFIXES if entry[0] <= largest * 1.0000001), default=_PREFIXES[0])
+    return 1.0 / best[0], best[1] + unit_sign(unit)
+
+
+def axis_label(what: str, unit: str) -> str:
+    """``what (unit)``, or just ``what`` for a pure number."""
+    return f"{what} ({unit})" if unit else what
+
+
+def engineering(value: float, unit: str = "", digits: int = 3) -> str:
+    """One number with a prefixed unit, for tables and captions: ``2.05 kN``."""
+    if not np.isfinite(value):
+        return "–"
+    factor, sign = prefixed([value], unit)
+    scaled = value * factor
+    text = f"{scaled:.{digits}g}"
+    if "e" in text:
+        mantissa, power = text.split("e")
+        text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
+    return f"{text} {sign}".strip()
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names of parameters broken after the location, so that they fit above a small panel."""
+    return [name.replace("].", "]\n") for name in names]
+
+
+def thinned(length: int, most: int) -> slice:
+    """Every k-th sample so that at most ``most`` remain."""
+    return slice(None, None, max(1, -(-length // most)))

@@ -1,0 +1,209 @@
+"""Figures of the selection, the posterior and the convergence of the sampler."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from bayes_nlsid.study.axes import prefixed, short_names
+from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, RED, canvas
+
+Array = NDArray[np.float64]
+
+
+def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mapping[str, object]], *, floor: float | None,
+                   linear: float) -> Figure:
+    """The score after each step, and every candidate that was tried for it.
+
+    Parameters
+    ----------
+    steps : sequence of dict
+        ``phase`` ("forward" or "backward"), ``name`` of the term added or removed, ``mse`` after it.
+    tried : sequence of dict
+        ``step`` (0-based index into ``steps``), ``name``, ``mse``.
+    floor : float or None
+        Mean square that sensor noise alone would leave.
+    linear : float
+        Mean square of the linear model.
+    """
+    figure, grid = canvas(1, 2, height=3.3, width_ratios=(1, 1.15))
+    left, right = grid[0]
+    scores = [linear, *(float(str(s["mse"])) for s in steps)]
+    labels = ["linear", *(("+ " if s["phase"] == "forward" else "− ") + str(s["name"]) for s in steps)]
+    at = np.arange(len(scores))
+    rng = np.random.default_rng(0)  # spreads overlapping dots sideways; the picture is the same every time
+    points = [(int(str(t["step"])) + 1, float(str(t["mse"]))) for t in tried]
+    if points:
+        x, y = np.array(points, dtype=float).T
+        ok = np.isfinite(y) & (y > 0)
+        left.plot(x[ok] + rng.uniform(-0.16, 0.16, ok.sum()), y[ok], ".", color=GREY, alpha=0.55, markersize=4, label="every candidate tried")
+    for phase, marker, color in (("forward", "o", BLUE), ("backward", "s", RED)):
+        chosen = [i + 1 for i, s in enumerate(steps) if s["phase"] == phase]
+        left.plot(chosen, [scores[i] for i in chosen], marker, color=color, label=f"kept, {phase}", markersize=6)
+    left.plot(at, scores, "-", color=BLUE, linewidth=1.0)
+    left.plot(0, linear, "D", color="black", markersize=5)
+    if floor is not None and floor > 0:
+        left.axhline(floor, color=GREEN, linestyle="--", linewidth=1.2, label="noise floor")
+    left.set_yscale("log")
+    left.set(xticks=at, xlabel="step", ylabel="mean square residual")
+    left.set_xticklabels(labels, rotation=30 if len(labels) > 3 else 0, ha="right" if len(labels) > 3 else "center")
+    left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handletextpad=0.3, columnspacing=0.8)
+    _first_ranking(right, tried, floor, linear)
+    return figure
+
+
+def _first_ranking(axes: Axes, tried: Sequence[Mapping[str, object]], floor: float | None, linear: float) -> None:
+    """The best dozen candidates of the first step."""
+    first = sorted(((float(str(t["mse"])), str(t["name"])) for t in tried if int(str(t["step"])) == 0 and np.isfinite(float(str(t["mse"])))))[:12]
+    if not first:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "the form was given,\nnothing to choose from", ha="center", va="center", color=GREY, transform=axes.transAxes)
+        return
+    at = np.arange(len(first))
+    axes.hlines(at, [m for m, _ in first], linear, color="#c9d8e6", linewidth=4)
+    axes.plot([m for m, _ in first], at, "o", color=BLUE)
+    axes.axvline(linear, color="black", linewidth=0.9)
+    axes.annotate("linear model", (linear, 1.0), xycoords=("data", "axes fraction"), ha="right", va="bottom", fontsize=7.5)
+    if floor is not None and floor > 0:
+        axes.axvline(floor, color=GREEN, linestyle="--", linewidth=1.2)
+    axes.set_xscale("log")
+    axes.set(yticks=at, yticklabels=[name for _, name in first], ylim=(len(first) - 0.5, -0.7), xlabel="mean square residual, first step")
+
+
+def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str], *, prior: Array | None = None, fit: Array | None = None,
+                        identifiable: Sequence[bool] = ()) -> Figure:
+    """Histogram of every parameter with its prior, the fit, and the 90 % interval.
+
+    Parameters
+    ----------
+    draws : ndarray (D, P)
+        Physical units.
+    names, units : sequence of str, length P
+    prior : ndarray (E, P), optional
+        Draws from the prior.
+    fit : ndarray (P,), optional
+    identifiable : sequence of bool, optional
+    """
+    count = len(names)
+    columns = min(4, count)
+    rows = -(-count // columns)
+    figure, grid = canvas(rows, columns, height=0.6 + 1.75 * rows)
+    for i, axes in enumerate(grid.ravel()):
+        if i >= count:
+            axes.set_axis_off()
+            continue
+        factor, unit = prefixed(np.quantile(np.abs(draws[:, i]), [0.5]), units[i])
+        values = factor * draws[:, i]
+        low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+        span = np.quantile(values, [0.001, 0.999]) + np.array([-0.05, 0.05]) * max(np.ptp(values), 1e-12 * abs(middle) + 1e-300)
+        bins = np.linspace(*span, 45)
+        axes.hist(values, bins=bins, density=True, color=BLUE, alpha=0.75, label="posterior")
+        if prior is not None:
+            inside = factor * prior[:, i]
+            share = np.mean((inside >= span[0]) & (inside <= span[1]))
+            height = share / (span[1] - span[0]) if share > 0 else 0.0
+            axes.hist(inside, bins=bins, weights=np.full(len(inside), 1 / (len(inside) * (bins[1] - bins[0]))), histtype="step", color=GREY,
+                      linestyle="--", linewidth=1.1, label="prior" if height else "prior (outside)")
+        axes.axvspan(low, high, color=BLUE, alpha=0.10, linewidth=0, label="90 % interval")
+        if fit is not None:
+            axes.axvline(factor * fit[i], color=RED, linewidth=1.2, label="least squares")
+        flag = "" if not len(identifiable) or identifiable[i] else " – not identifiable"
+        axes.set_title(short_names([names[i]])[0] + flag, fontsize=8, color=RED if flag else "black")
+        axes.set(yticks=[], xlim=span, xlabel=unit or "–")
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    return figure
+
+
+def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *, worst: Sequence[int], fit: Array | None = None) -> Figure:
+    """Pairwise views of the parameters that are known least well.
+
+    Parameters
+    ----------
+    draws : ndarray (D, P)
+    worst : sequence of int
+        Which parameters to show, at most five.
+    """
+    chosen = list(worst)[:5]
+    k = len(chosen)
+    figure, grid = canvas(k, k, height=1.0 + 1.3 * k)
+    some = draws[np.linspace(0, len(draws) - 1, min(len(draws), 1500)).astype(int)]
+    for i, row in enumerate(chosen):
+        for j, column in enumerate(chosen):
+            axes = grid[i][j]
+            if j > i:
+                axes.set_axis_off()
+                continue
+            fx, ux = prefixed(np.quantile(np.abs(draws[:, column]), [0.5]), units[column])
+            fy, uy = prefixed(np.quantile(np.abs(draws[:, row]), [0.5]), units[row])
+            if i == j:
+                axes.hist(fx * draws[:, row], bins=40, color=BLUE, alpha=0.75)
+                axes.set_yticks([])
+            else:
+                axes.plot(fx * some[:, column], fy * some[:, row], ".", color=BLUE, markersize=1.6, alpha=0.35, rasterized=True)
+                correlation = np.corrcoef(draws[:, column], draws[:, row])[0, 1]
+                axes.text(0.96, 0.95, f"ρ = {correlation:+.2f}", transform=axes.transAxes, ha="right", va="top", fontsize=7,
+                          bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0})
+                if fit is not None:
+                    axes.plot(fx * fit[column], fy * fit[row], "+", color=RED, markersize=9, markeredgewidth=1.6)
+            axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
+            if i != j:
+                axes.yaxis.set_major_locator(MaxNLocator(3))
+            if i == k - 1:
+                axes.set_xlabel(f"{short_names([names[column]])[0]}" + (f" ({ux})" if ux else ""), fontsize=7.5)
+            else:
+                axes.set_xticklabels([])
+            if j == 0 and i > 0:
+                axes.set_ylabel(f"{short_names([names[row]])[0]}" + (f" ({uy})" if uy else ""), fontsize=7.5)
+            elif i != j:
+                axes.set_yticklabels([])
+    return figure
+
+
+def convergence(log_probability: Array, chains: Array, names: Sequence[str], units: Sequence[str], *, kept_from: int = 0,
+                worst: Sequence[int] = ()) -> Figure:
+    """Traces of independent ensembles: log-probability and the slowest parameters.
+
+    Parameters
+    ----------
+    log_probability : ndarray (M, n, W)
+        Ensembles, steps, walkers.
+    chains : ndarray (M, n, W, P)
+        Physical units.
+    kept_from : int
+        First step that counts; before it is burn-in.
+    worst : sequence of int
+        Parameters to show, at most three.
+    """
+    chosen = list(worst)[:3]
+    figure, grid = canvas(1 + len(chosen), 1, height=1.2 + 1.15 * (1 + len(chosen)), sharex=True)
+    steps = np.arange(log_probability.shape[1])
+    low = np.quantile(log_probability[:, log_probability.shape[1] // 3:], 0.002)
+    for m in range(log_probability.shape[0]):
+        color, label = CYCLE[m % len(CYCLE)], f"ensemble {m + 1}"
+        grid[0][0].plot(steps, np.median(log_probability[m], axis=1), color=color, label=label, linewidth=0.9)
+        for row, i in enumerate(chosen):
+            factor, unit = prefixed(np.quantile(np.abs(chains[..., i]), [0.5]), units[i])
+            quantiles = factor * np.quantile(chains[m, :, :, i], [0.05, 0.5, 0.95], axis=1)
+            axes = grid[row + 1][0]
+            axes.fill_between(steps, quantiles[0], quantiles[2], color=color, alpha=0.15, linewidth=0)
+            axes.plot(steps, quantiles[1], color=color, linewidth=0.9)
+            axes.set_ylabel(short_names([names[i]])[0] + (f"\n({unit})" if unit else ""), fontsize=7.5)
+    top = float(log_probability.max())
+    grid[0][0].set_ylim(low - 0.1 * (top - low) - 1e-9, top + 0.1 * (top - low) + 1e-9)
+    grid[0][0].set_ylabel("log-probability\n(median walker)", fontsize=7.5)
+    for axes in grid[:, 0]:
+        axes.set_xlim(0, steps[-1])
+        if kept_from > 0:
+            axes.axvspan(0, kept_from, color="#dddddd", alpha=0.6, linewidth=0)
+    if kept_from > 0:
+        grid[0][0].annotate("burn-in", (0.5 * kept_from, 0.06), xycoords=("data", "axes fraction"), ha="center", fontsize=7.5)
+    grid[0][0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4)
+    grid[-1][0].set_xlabel("step (bands: 5–95 % of the walkers)")
+    return figure

@@ -1,0 +1,165 @@
+"""Figures of what the identified model predicts: joint loops, backbones, records kept for judging."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayes_nlsid.study.axes import prefixed, unit_sign
+from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, RED, canvas, draw_signal, envelope
+
+Array = NDArray[np.float64]
+BAND = "5–95 %"
+
+
+def joint_loops(loops: Sequence[Mapping[str, object]]) -> Figure:
+    """Joint force against relative motion, with the spread of the posterior.
+
+    Parameters
+    ----------
+    loops : sequence of dict
+        ``location``, ``q`` (n,) m, ``force`` (S, n) N, ``linear`` N/m (spring already in the linear model, for reference), ``unit`` of q.
+    """
+    columns = min(3, max(1, len(loops)))
+    rows = max(1, -(-len(loops) // columns))
+    figure, grid = canvas(rows, columns, height=0.5 + 2.5 * rows)
+    for i, axes in enumerate(grid.ravel()):
+        if i >= len(loops):
+            axes.set_axis_off()
+            continue
+        q, force = np.asarray(loops[i]["q"], dtype=float), np.asarray(loops[i]["force"], dtype=float)
+        fq, uq = prefixed(q, str(loops[i].get("unit", "m")))
+        ff, uf = prefixed(np.quantile(np.abs(force), 0.99), "N")
+        for k in range(min(len(force), 40)):
+            axes.plot(fq * q, ff * force[k], color=BLUE, alpha=0.10, linewidth=0.8)
+        axes.plot(fq * q, ff * np.median(force, axis=0), color=BLUE, linewidth=1.4, label="median")
+        axes.plot([], [], color=BLUE, alpha=0.3, label="single posterior draws")
+        energy = np.abs(np.sum(0.5 * (force + np.roll(force, -1, axis=1)) * (np.roll(q, -1) - q), axis=1))
+        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95])
+        fe, ue = prefixed(high, "J")
+        axes.set_title(f"{loops[i]['location']}\nenergy per cycle {fe * middle:.2g} ({fe * low:.2g}–{fe * high:.2g}) {ue}", fontsize=8)
+        axes.set(xlabel=f"relative displacement ({uq})", ylabel=f"force beyond the linear model ({uf})" if i % columns == 0 else f"({uf})")
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2)
+    return figure
+
+
+def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | None = None, *, location: str = "",
+                   alternatives: Sequence[Mapping[str, object]] = (), published: Sequence[Mapping[str, object]] = (),
+                   numerical: Array | None = None) -> Figure:
+    """Frequency and damping against amplitude: posterior bands over the backbone measured directly.
+
+    Parameters
+    ----------
+    bands : dict
+        ``amplitude`` (K,) m, ``frequency_q05/q50/q95`` (K,) Hz, ``damping_q05/q50/q95`` (K,) ratio.
+    measured : dict, optional
+        ``amplitude``, ``frequency``, ``damping`` (K2,).
+    alternatives : sequence of dict
+        ``name``, ``amplitude``, ``frequency``, ``damping`` of rival models (point estimates).
+    published : sequence of dict
+        ``label`` and spans ``frequency`` (Hz), ``damping`` (ratio), either may be None.
+    numerical : ndarray (K,), optional
+        The integrator's own error of frequency, Hz.
+    """
+    figure, grid = canvas(1, 2, height=3.7)
+    left, right = grid[0]
+    everything = [bands["amplitude"], *([measured["amplitude"]] if measured else [])]
+    fa, ua = prefixed(np.nanmax(np.concatenate(everything)), "m")
+    for axes, key, factor in ((left, "frequency", 1.0), (right, "damping", 100.0)):
+        axes.fill_between(fa * bands["amplitude"], factor * bands[f"{key}_q05"], factor * bands[f"{key}_q95"], color=BLUE, alpha=0.28,
+                          linewidth=0, label=f"model, {BAND}")
+        axes.plot(fa * bands["amplitude"], factor * bands[f"{key}_q50"], color=BLUE, label="model, median")
+        for k, rival in enumerate(alternatives):
+            axes.plot(fa * np.asarray(rival["amplitude"]), factor * np.asarray(rival[key]), linestyle=("--", ":", "-.")[k % 3],
+                      color=(GREEN, ORANGE, GREY)[k % 3], label=f"{rival['name']} (fit)")
+        if measured is not None:
+            axes.plot(fa * measured["amplitude"], factor * measured[key], "o", color=RED, markersize=3.4, mfc="white", label="measured directly")
+        for k, span in enumerate(published):
+            limits = span.get(key)
+            if limits is not None:
+                low, high = np.asarray(limits, dtype=float)
+                axes.axhspan(factor * low, factor * high, color=CYCLE[(k + 2) % len(CYCLE)], alpha=0.10, linewidth=0, label=str(span["label"]))
+        axes.set_xscale("log")
+        axes.set_xlabel(f"amplitude at {location} ({ua})" if location else f"amplitude ({ua})")
+    _limit(left, [bands["frequency_q05"], bands["frequency_q95"], *([measured["frequency"]] if measured else [])])
+    _limit(right, [100 * bands["damping_q05"], 100 * bands["damping_q95"], *([100 * measured["damping"]] if measured else [])], zero=True)
+    left.set_ylabel("frequency (Hz)")
+    right.set_ylabel("damping (% of critical)")
+    if numerical is not None and np.isfinite(numerical).any():
+        left.set_title(f"integrator's own error ≤ {np.nanmax(np.abs(numerical)):.1g} Hz", fontsize=8, color=GREY)
+    handles, labels = left.get_legend_handles_labels()
+    extra = [(h, n) for h, n in zip(*right.get_legend_handles_labels(), strict=True) if n not in labels]
+    figure.legend(handles + [h for h, _ in extra], labels + [n for _, n in extra], loc="outside lower center", ncols=3)
+    return figure
+
+
+def _limit(axes: Axes, values: Sequence[Array], zero: bool = False) -> None:
+    """Let the model and the measurement set the range, not a rival that runs away."""
+    pooled = np.concatenate([np.ravel(v) for v in values])
+    pooled = pooled[np.isfinite(pooled)]
+    if pooled.size:
+        low, high = float(pooled.min()), float(pooled.max())
+        margin = 0.25 * (high - low) or 0.01 * abs(high) or 1.0
+        axes.set_ylim(max(0.0, low - margin) if zero else low - margin, high + margin)
+
+
+def heldout_overlay(time: Array, measured: Array, low: Array, middle: Array, high: Array, *, unit: str, channel: str, zoom: float,
+                    noise: float = 0.0, facts: str = "") -> Figure:
+    """A record kept for judging: measured against predicted, whole and at three moments, with the residual.
+
+    Parameters
+    ----------
+    time, measured, low, middle, high : ndarray (n,)
+        ``low`` and ``high`` bound the 90 % predictive band.
+    unit, channel : str
+    zoom : float
+        Length of each close-up, s.
+    noise : float
+        Standard deviation of the sensor's noise.
+    facts : str
+        One line of numbers for the title.
+    """
+    figure = _blank(4.8)
+    grid = figure.add_gridspec(3, 3, height_ratios=(1, 1.25, 0.75))
+    factor, sign = prefixed(measured, unit)
+    sign = sign or unit_sign(unit)
+    whole, error = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
+    draw_signal(whole, time, factor * measured, color=GREY, label="measured")
+    t, bottom, top = envelope(time, factor * middle, columns=250)  # each stretch spans a few cycles
+    whole.plot(t, top, color=BLUE, linewidth=1.0, label="predicted, median (extremes)")
+    whole.plot(t, bottom, color=BLUE, linewidth=1.0)
+    whole.set(ylabel=sign, xlim=(time[0], time[-1]))
+    whole.set_title(f"{channel}   {facts}", fontsize=8.5)
+    lines, words = whole.get_legend_handles_labels()
+    for k, centre in enumerate(np.array([0.03, 0.35, 0.8]) * (time[-1] - time[0]) + time[0]):
+        axes = figure.add_subplot(grid[1, k])
+        i, j = np.searchsorted(time, [centre, centre + zoom])
+        part = slice(max(0, int(i)), max(int(j), int(i) + 2))
+        axes.fill_between(time[part], factor * low[part], factor * high[part], color=BLUE, alpha=0.3, linewidth=0, label=f"predicted, {BAND}")
+        axes.plot(time[part], factor * middle[part], color=BLUE, linewidth=1.0, label="median")
+        axes.plot(time[part], factor * measured[part], color="black", linewidth=0.9, linestyle="--", label="measured")
+        axes.set(xlim=(time[part][0], time[part][-1]), ylabel=sign if k == 0 else None)
+        axes.locator_params(axis="x", nbins=4)
+        whole.axvspan(time[part][0], time[part][-1], color=ORANGE, alpha=0.35, linewidth=0)
+        if k == 0:
+            close, names = axes.get_legend_handles_labels()
+            lines, words = lines + close[:1] + close[2:], words + names[:1] + [names[2] + " (close-ups)"]
+    whole.legend(lines, words, loc="upper right", ncols=2)
+    draw_signal(error, time, factor * (measured - middle), color=RED)
+    if noise > 0:
+        error.axhspan(-1.65 * factor * noise, 1.65 * factor * noise, color=GREEN, alpha=0.25, linewidth=0, label="sensor noise, 90 %")
+        error.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), borderaxespad=0.0)
+    error.set(xlabel="time (s)", ylabel=f"measured −\npredicted ({sign})", xlim=(time[0], time[-1]))
+    return figure
+
+
+def _blank(height: float) -> Figure:
+    """A figure without axes."""
+    figure, grid = canvas(height=height)
+    figure.delaxes(grid[0][0])
+    return figure

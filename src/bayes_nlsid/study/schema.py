@@ -1,0 +1,248 @@
+"""What a study file says, checked and in SI: plain frozen records, one for each table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, final
+
+from bayes_nlsid.recordings.reading import RecordingSpec
+
+StructureKind = Literal["beam", "matrices", "oscillator"]
+PRIOR_KINDS = ("flat", "flat_symlog", "normal", "lognormal")
+STAGES = ("read", "linear", "identify", "posterior", "predict", "report")
+
+
+@final
+@dataclass(frozen=True)
+class StructureEntry:
+    """``[structure]``: ``values`` are the parameters of the builder of ``kind``, in SI."""
+
+    kind: StructureKind
+    values: tuple[tuple[str, Any], ...] = ()
+    files: tuple[tuple[str, Path], ...] = ()
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """``values`` as a dictionary."""
+        return dict(self.values)
+
+
+@final
+@dataclass(frozen=True)
+class ReductionEntry:
+    """``[reduction]``: ``masters`` are groups (``"sensors"``, ``"inputs"``, ``"joints"``) or names of degrees of freedom."""
+
+    method: Literal["none", "guyan", "iirs"] = "none"
+    masters: tuple[str, ...] = ("sensors", "inputs", "joints")
+    modes: int | None = None
+    iterations: int = 30
+    damping: float = 1e-3
+
+
+@final
+@dataclass(frozen=True)
+class LinearEntry:
+    """``[linear]``: where modes are measured and which parts of the structure are updated to them.
+
+    ``modes`` are 1-based; ``damping`` overrides what is measured, mode by mode; ``fit`` says whether modes are identified at all.
+    """
+
+    recording: str | None = None
+    window: tuple[float, float] | None = None
+    modes: tuple[int, ...] = ()
+    update: tuple[str, ...] = ()
+    damping: tuple[float, ...] = ()
+    use_measured: bool = True
+
+
+@final
+@dataclass(frozen=True)
+class ElementEntry:
+    """``[[identification.elements]]``: a term whose form and place are known; only its parameters are estimated."""
+
+    term: str
+    locations: tuple[str, ...]
+    tied: bool = False
+    excess: bool = True
+    fixed: tuple[tuple[str, float], ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class AlternativeEntry:
+    """``[[identification.alternatives]]``: another set of candidates, selected and predicted beside the main one."""
+
+    name: str
+    candidates: tuple[str, ...] = ()
+    elements: tuple[ElementEntry, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class IdentificationEntry:
+    """``[identification]``: Sections 2.2 and 2.3.
+
+    ``modes``, ``main`` and ``free_modes`` are 1-based. ``candidates`` are names of terms with groups already spelled out; empty means
+    that the form is known (``elements``). ``output_error`` refines the regression by least squares on the simulated response.
+    """
+
+    scenario: str = "S2"
+    main: int = 1
+    modes: tuple[int, ...] = (1,)
+    free_modes: tuple[int, ...] = ()
+    band: tuple[float, float] | None = None
+    joints: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
+    elements: tuple[ElementEntry, ...] = ()
+    alternatives: tuple[AlternativeEntry, ...] = ()
+    tied: bool = False
+    excess: bool = True
+    widening: float = 1.0
+    eps1: float | None = None
+    eps2: float | None = None
+    starts: int = 50
+    rate: float | None = None
+    output_error: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class UserTermEntry:
+    """``[[terms]]``: a term of the user's own, from a checked expression."""
+
+    name: str
+    formula: str
+    params: tuple[tuple[tuple[str, Any], ...], ...]
+    parity: str | None = None
+    meaning: str = ""
+
+
+@final
+@dataclass(frozen=True)
+class PriorEntry:
+    """``[[posterior.priors]]``: what is known of a parameter before the recording, in physical units.
+
+    ``parameter`` may hold ``*`` for any part of a name. ``a``, ``b``: lower and upper bound (flat kinds), mean and standard deviation
+    (normal), median and standard deviation of the logarithm (lognormal).
+    """
+
+    parameter: str
+    kind: str
+    a: float
+    b: float
+
+
+@final
+@dataclass(frozen=True)
+class PosteriorEntry:
+    """``[posterior]``."""
+
+    likelihood: str = "whittle"
+    ensembles: int = 4
+    steps: int = 2000
+    walkers: int | None = None
+    priors: tuple[PriorEntry, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class PredictionEntry:
+    """``[prediction]``: the backbone (release from a mode shape, zero crossings) and records kept for judging.
+
+    ``at`` names the location whose amplitude is meant, ``amplitude`` (m) where the release starts, ``mode`` is 1-based, ``seconds``
+    the length of the decay, ``samples`` the number of posterior draws.
+    """
+
+    at: str
+    amplitude: float
+    mode: int = 1
+    samples: int = 100
+    seconds: float | None = None
+    fs: float | None = None
+    scheme: str = "hht"
+    amplitudes: tuple[float, ...] = ()
+    measured: str | None = None
+    band: tuple[float, float] | None = None
+    heldout: tuple[str, ...] = ()
+    draws: int = 100
+
+
+@final
+@dataclass(frozen=True)
+class PublishedEntry:
+    """``[[report.published]]``: a figure from the literature to stand beside ours; spans of frequency (Hz) and damping ratio."""
+
+    label: str
+    frequency: tuple[float, float] | None = None
+    damping: tuple[float, float] | None = None
+    text: str = ""
+
+
+@final
+@dataclass(frozen=True)
+class ReportEntry:
+    """``[report]``: ``notes`` are sentences that belong into the story."""
+
+    notes: tuple[str, ...] = ()
+    published: tuple[PublishedEntry, ...] = ()
+    window: tuple[float, float] | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Study:
+    """A whole study file.
+
+    Parameters
+    ----------
+    file : Path
+    title : str
+    seed : int
+    structure : StructureEntry
+    reduction : ReductionEntry
+    recordings : tuple of RecordingSpec
+    linear : LinearEntry
+    identification, posterior, prediction : entries or None
+        A stage whose table is missing is not run.
+    terms : tuple of UserTermEntry
+    report : ReportEntry
+    locations : tuple of str
+        Every location the structure knows.
+    inputs : tuple of (str, str)
+        Files the study reads, relative to it where possible, with their SHA-256.
+    """
+
+    file: Path
+    title: str
+    seed: int
+    structure: StructureEntry
+    reduction: ReductionEntry = field(default_factory=ReductionEntry)
+    recordings: tuple[RecordingSpec, ...] = ()
+    linear: LinearEntry = field(default_factory=LinearEntry)
+    identification: IdentificationEntry | None = None
+    terms: tuple[UserTermEntry, ...] = ()
+    posterior: PosteriorEntry | None = None
+    prediction: PredictionEntry | None = None
+    report: ReportEntry = field(default_factory=ReportEntry)
+    locations: tuple[str, ...] = ()
+    inputs: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Stages this study names, in order."""
+        asked = {"identify": self.identification, "posterior": self.posterior, "predict": self.prediction}
+        return tuple(stage for stage in STAGES if stage not in asked or asked[stage] is not None)
+
+    def recording(self, name: str) -> RecordingSpec:
+        """The specification of a recording.
+
+        Raises
+        ------
+        ValueError
+            If there is none of that name.
+        """
+        for entry in self.recordings:
+            if entry.name == name:
+                return entry
+        raise ValueError(f"no recording {name!r}; known are {[r.name for r in self.recordings]}")
