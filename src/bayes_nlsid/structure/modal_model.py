@@ -15,7 +15,7 @@ from bayes_nlsid.structure.structure import Modes, Structure
 from bayes_nlsid.structure.structure import modes as full_modes
 
 if TYPE_CHECKING:
-    from bayes_nlsid.structure.identify import IdentifiedModes
+    from bayes_nlsid.structure.identified import IdentifiedModes
 
 UNKNOWN_DAMPING = 1e-3
 """Damping ratio of modes that were not measured (Section 3: 0.1 %)."""
@@ -77,7 +77,7 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
 def with_damping(model: ModalModel, zeta: float | Sequence[float] | NDArray[np.float64] | IdentifiedModes,
                  measured_frequencies: bool = False) -> ModalModel:
     """The model with other damping ratios, and optionally measured frequencies; see `modal_model`."""
-    from bayes_nlsid.structure.identify import IdentifiedModes, pair
+    from bayes_nlsid.structure.identified import IdentifiedModes, pair
 
     if not isinstance(zeta, IdentifiedModes):
         values = np.broadcast_to(np.asarray(zeta, dtype=float), (model.modes,)) if np.ndim(zeta) == 0 else np.asarray(zeta, dtype=float)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.recordings.kinematics import ORDER, Kinematics, kinematics
-from bayes_nlsid.recordings.noise import NoiseFloor, noise_psd
 from bayes_nlsid.recordings.recording import Channel, Recording
 from bayes_nlsid.structure.modal import ModalData, ModalModel
+
+if TYPE_CHECKING:
+    from bayes_nlsid.recordings.noise import NoiseFloor
 
 LARGEST_CONDITION = 100.0
 """Condition number of the sensor rows beyond which modes cannot be told apart in practice."""
@@ -62,7 +65,7 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
     if static_correction and model.residual is None:
         raise ValueError("static_correction needs a model with residual flexibility; build it with residual=True")
     rows = model.rows([c.location for c in recording.channels])
-    psd = noise if noise is not None else noise_psd(recording)
+    psd = noise if noise is not None else _estimated_noise(recording)
     whole = list(range(len(chosen)))
     plan = [(whole, whole, band)] if bands is None else [([i], _overlapping(bands, i), bands[i]) for i in whole]
     columns: list[dict[str, NDArray[np.float64]]] = [{} for _ in whole]
@@ -91,6 +94,12 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
         q, qd = q + static.displacement @ G.T, qd + static.velocity @ G.T
     return ModalData(recording.name, dt, chosen, u, v, a, force, tuple(joints), q, qd, valid, band, spread, max(conditions),
                      recording.period is not None)
+
+
+def _estimated_noise(recording: Recording) -> NoiseFloor:
+    from bayes_nlsid.recordings.noise import noise_psd
+
+    return noise_psd(recording)
 
 
 def modal_filter(rows: NDArray[np.float64], noise: NDArray[np.float64], names: Sequence[str]) -> tuple[NDArray[np.float64], float]:
