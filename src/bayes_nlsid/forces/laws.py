@@ -2,7 +2,8 @@
 
 Every law is ``law(q, v, *p) -> force`` and every slope ``slope(q, v, *p) -> (df/dq, df/dv)`` in m, m/s, N. They use only numpy
 functions that act element by element and never branch on data, so the same Python function broadcasts over any batch and
-compiles as it stands for scalars (``forces/compiled.py``). Slopes are finite everywhere: 0 where the derivative is not.
+compiles as it stands for scalars (``forces/compiled.py``); all stand at module level, so that terms can be sent to other
+processes. Monomials take their exponent last, and ``forces/library.py`` binds it. Slopes are finite everywhere: 0 where the derivative is not.
 Either entry of a slope may be the plain number 0.0, which broadcasts.
 
 Iwan laws are written with the slip ratio r = |q|/phi_max as load over capacity, never as a division by phi_max: with
@@ -15,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from bayes_nlsid.forces.term import Law
-
 Value = Any  # a float or an array: the laws do not care
 
 
@@ -25,69 +24,72 @@ def where(condition: Value, yes: Value, no: Value) -> Value:
     return np.where(condition, yes, no)
 
 
-def displacement_monomial(power: float, odd: bool) -> tuple[Law, Law]:
-    """Law c sgn(q)|q|^n (odd) or c |q|^n, and its slope."""
-    at_zero = 1.0 if odd and power == 1.0 else 0.0
-
-    def odd_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.sign(q) * np.abs(q) ** power
-
-    def odd_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(q)
-        return c * power * where(a > 0.0, where(a > 0.0, a, 1.0) ** (power - 1.0), at_zero), 0.0
-
-    def even_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.abs(q) ** power
-
-    def even_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(q)
-        return c * power * np.sign(q) * where(a > 0.0, a, 1.0) ** (power - 1.0), 0.0
-
-    return (odd_law, odd_slope) if odd else (even_law, even_slope)
+def displacement_odd(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c sgn(q)|q|^n."""
+    return c * np.sign(q) * np.abs(q) ** power
 
 
-def velocity_monomial(power: float, odd: bool) -> tuple[Law, Law]:
-    """Law c sgn(v)|v|^n (odd; n = 0 is dry friction) or c |v|^n, and its slope."""
-    at_zero = 1.0 if odd and power == 1.0 else 0.0
-    lower = power - 1.0 if power > 0.0 else 0.0  # dry friction has slope 0, and |v|^-1 may overflow
-
-    def odd_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.sign(v) * np.abs(v) ** power
-
-    def odd_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(v)
-        return 0.0, c * power * where(a > 0.0, where(a > 0.0, a, 1.0) ** lower, at_zero)
-
-    def even_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.abs(v) ** power
-
-    def even_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(v)
-        return 0.0, c * power * np.sign(v) * where(a > 0.0, a, 1.0) ** lower
-
-    return (odd_law, odd_slope) if odd else (even_law, even_slope)
+def displacement_odd_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n |q|^(n−1)."""
+    a = np.abs(q)
+    return c * power * where(a > 0.0, where(a > 0.0, a, 1.0) ** (power - 1.0), where(power == 1.0, 1.0, 0.0)), 0.0
 
 
-def mixed_monomial(power: float, odd: bool) -> tuple[Law, Law]:
-    """Law c sgn(q)|q|^n v (odd in q) or c |q|^n v, and its slope."""
-    at_zero = 1.0 if odd and power == 1.0 else 0.0
+def displacement_even(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c |q|^n."""
+    return c * np.abs(q) ** power
 
-    def odd_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.sign(q) * np.abs(q) ** power * v
 
-    def odd_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(q)
-        growth = where(a > 0.0, where(a > 0.0, a, 1.0) ** (power - 1.0), at_zero)
-        return c * power * growth * v, c * np.sign(q) * a ** power
+def displacement_even_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n sgn(q)|q|^(n−1)."""
+    a = np.abs(q)
+    return c * power * np.sign(q) * where(a > 0.0, a, 1.0) ** (power - 1.0), 0.0
 
-    def even_law(q: Value, v: Value, c: Value) -> Value:
-        return c * np.abs(q) ** power * v
 
-    def even_slope(q: Value, v: Value, c: Value) -> Value:
-        a = np.abs(q)
-        return c * power * np.sign(q) * where(a > 0.0, a, 1.0) ** (power - 1.0) * v, c * a ** power
+def mixed_odd(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c sgn(q)|q|^n v: odd in q."""
+    return c * np.sign(q) * np.abs(q) ** power * v
 
-    return (odd_law, odd_slope) if odd else (even_law, even_slope)
+
+def mixed_odd_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n |q|^(n−1) v, c sgn(q)|q|^n."""
+    a = np.abs(q)
+    growth = where(a > 0.0, where(a > 0.0, a, 1.0) ** (power - 1.0), where(power == 1.0, 1.0, 0.0))
+    return c * power * growth * v, c * np.sign(q) * a ** power
+
+
+def mixed_even(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c |q|^n v: even in q."""
+    return c * np.abs(q) ** power * v
+
+
+def mixed_even_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n sgn(q)|q|^(n−1) v, c |q|^n."""
+    a = np.abs(q)
+    return c * power * np.sign(q) * where(a > 0.0, a, 1.0) ** (power - 1.0) * v, c * a ** power
+
+
+def velocity_odd(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c sgn(v)|v|^n; n = 0 is dry friction."""
+    return c * np.sign(v) * np.abs(v) ** power
+
+
+def velocity_odd_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n |v|^(n−1)."""
+    # For n = 0 the factor n is zero, but |v|^-1 might overflow: any other exponent will do.
+    a, lower = np.abs(v), where(power > 0.0, power - 1.0, 0.0)
+    return 0.0, c * power * where(a > 0.0, where(a > 0.0, a, 1.0) ** lower, where(power == 1.0, 1.0, 0.0))
+
+
+def velocity_even(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c |v|^n."""
+    return c * np.abs(v) ** power
+
+
+def velocity_even_slope(q: Value, v: Value, c: Value, power: Value) -> Value:
+    """c n sgn(v)|v|^(n−1)."""
+    a = np.abs(v)
+    return 0.0, c * power * np.sign(v) * where(a > 0.0, a, 1.0) ** (power - 1.0)
 
 
 def spring(q: Value, v: Value, k: Value) -> Value:

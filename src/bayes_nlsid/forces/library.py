@@ -23,10 +23,12 @@ taken as functions of the velocity, after the marks over 39 and 40; the argument
 
 from __future__ import annotations
 
+from functools import partial
+
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.forces import laws
 from bayes_nlsid.forces.parameter import Param
-from bayes_nlsid.forces.term import Term
+from bayes_nlsid.forces.term import Confidence, Law, Term
 
 PAPER = "Safari and Londoño Monsalve 2023, Table 1"
 SLIP = Param("f_s", "N", "force", meaning="force at which the whole contact slips")
@@ -58,28 +60,34 @@ def _power(symbol: str, power: float, odd: bool) -> str:
     return f"sign({symbol})*{size}" if odd else size
 
 
+def _bound(family: str, power: float, odd: bool) -> tuple[Law, Law]:
+    """Law and slope of a monomial with its exponent bound."""
+    name = f"{family}_{'odd' if odd else 'even'}"
+    return partial(getattr(laws, name), power=float(power)), partial(getattr(laws, f"{name}_slope"), power=float(power))
+
+
 def _coefficient(unit: str) -> tuple[Param, ...]:
     return (Param("c", unit, "coefficient", meaning="coefficient"),)
 
 
-def _displacement(index: int | None, name: str, power: float, meaning: str, odd: bool = True, confidence: str = "H") -> Term:
-    law, slope = laws.displacement_monomial(power, odd)
+def _displacement(index: int | None, name: str, power: float, meaning: str, odd: bool = True, confidence: Confidence = "H") -> Term:
+    law, slope = _bound("displacement", power, odd)
     return Term(name, f"c*{_power('q', power, odd)}", _coefficient(_unit(power)), law, slope, index=index, linear=True,
-                parity="odd" if odd else "even", confidence=confidence if index else "-",  # type: ignore[arg-type]
+                parity="odd" if odd else "even", confidence=confidence if index else "-",
                 meaning=meaning, source=PAPER if index else "")
 
 
-def _mixed(index: int, name: str, power: float, odd: bool, meaning: str, confidence: str = "H") -> Term:
-    law, slope = laws.mixed_monomial(power, odd)
+def _mixed(index: int, name: str, power: float, odd: bool, meaning: str, confidence: Confidence = "H") -> Term:
+    law, slope = _bound("mixed", power, odd)
     return Term(name, f"c*{_power('q', power, odd)}*v", _coefficient(_unit(power, 1)), law, slope, index=index, linear=True,
-                parity="even" if odd else "odd", dissipative=not odd, confidence=confidence,  # type: ignore[arg-type]
+                parity="even" if odd else "odd", dissipative=not odd, confidence=confidence,
                 meaning=meaning, source=PAPER)
 
 
-def _velocity(index: int, name: str, power: float, odd: bool, meaning: str, confidence: str = "H") -> Term:
-    law, slope = laws.velocity_monomial(power, odd)
+def _velocity(index: int, name: str, power: float, odd: bool, meaning: str, confidence: Confidence = "H") -> Term:
+    law, slope = _bound("velocity", power, odd)
     return Term(name, f"c*{_power('v', power, odd)}", _coefficient(_unit(0, power)), law, slope, index=index, linear=True,
-                parity="odd" if odd else "even", dissipative=odd, confidence=confidence,  # type: ignore[arg-type]
+                parity="odd" if odd else "even", dissipative=odd, confidence=confidence,
                 meaning=meaning, source=PAPER)
 
 
@@ -175,8 +183,8 @@ _MEMORY = (
          stiffness=laws.jenkins_stiffness, dissipative=True, meaning="elastic, perfectly plastic slider: parallelogram loop",
          source="Jenkins 1962; Masing 1926"),
     Term("iwan4_memory", _IWAN4, (SLIP, STICK, CHI, BETA), laws.iwan4, laws.iwan4_slope, memory="masing",
-         stiffness=laws.iwan4_stiffness, dissipative=True, meaning="four-parameter Iwan element with its hysteresis loop: micro-slip damping",
-         source="Segalman 2005; Masing 1926"),
+         stiffness=laws.iwan4_stiffness, dissipative=True,
+         meaning="four-parameter Iwan element with its hysteresis loop: micro-slip damping", source="Segalman 2005; Masing 1926"),
     Term("iwan5_memory", _IWAN5, (SLIP, STICK, CHI, BETA, THETA), laws.iwan5, laws.iwan5_slope, memory="sliders",
          stiffness=laws.iwan5_stiffness, dissipative=True,
          meaning="five-parameter Iwan element as parallel sliders whose force drops to theta when they break loose; the loop depends on "
@@ -234,12 +242,13 @@ def library_rows() -> list[dict[str, str]]:
     """
     rows = []
     for term in LIBRARY.values():
+        bounds = (f"{p.lower:g} to {p.upper:g}" if p.rule == "range" else p.rule for p in term.params)
         rows.append({
             "index": "" if term.index is None else str(term.index),
             "name": term.name,
             "formula": term.formula,
             "parameters": "; ".join(f"{p.name} [{p.unit or '-'}]" for p in term.params),
-            "bounds": "; ".join(f"{p.name}: {p.lower:g} to {p.upper:g}" if p.rule == "range" else f"{p.name}: {p.rule}" for p in term.params),
+            "bounds": "; ".join(f"{p.name}: {bound}" for p, bound in zip(term.params, bounds, strict=True)),
             "memory": term.memory,
             "parity": term.parity,
             "dissipates": "yes" if term.dissipative else "no",

@@ -90,7 +90,8 @@ def start_state(term: Term, p: ArrayLike) -> State:
                  np.zeros_like(slip), stiffness, slip)
 
 
-def trial(term: Term, state: State, q: ArrayLike, v: ArrayLike, dt: float, p: ArrayLike, excess: bool = False) -> tuple[Array, Array, Array]:
+def trial(term: Term, state: State, q: ArrayLike, v: ArrayLike, dt: float, p: ArrayLike,
+          excess: bool = False) -> tuple[Array, Array, Array]:
     """Force and tangents if the motion went on to (q, v); the state is left as it is.
 
     Parameters

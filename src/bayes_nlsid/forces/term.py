@@ -13,6 +13,7 @@ from bayes_nlsid.forces.parameter import Param
 
 Memory = Literal["none", "masing", "sliders", "bouc_wen"]
 Parity = Literal["odd", "even", "none"]
+Confidence = Literal["H", "M", "L", "-"]
 Law = Callable[..., NDArray[np.float64]]
 
 
@@ -69,7 +70,7 @@ class Term:
     linear: bool = False
     parity: Parity = "odd"
     dissipative: bool = False
-    confidence: Literal["H", "M", "L", "-"] = "-"
+    confidence: Confidence = "-"
     meaning: str = ""
     source: str = ""
 
