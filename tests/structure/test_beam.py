@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+
 from bayes_nlsid.structure.beam import LappedBeam, lapped_beam
 from bayes_nlsid.structure.chains import oscillator, spring_mass_chain
 from bayes_nlsid.structure.reduction import static_flexibility
 from bayes_nlsid.structure.structure import Structure, mac, modes
-from scipy.optimize import brentq
 
 STEEL = {"E": 2e11, "rho": 7800.0}
 SLENDER = {"length": 1.0, "width": 0.02, "height": 0.002, **STEEL}

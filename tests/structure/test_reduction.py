@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from bayes_nlsid.structure.beam import LappedBeam, lapped_beam
 from bayes_nlsid.structure.chains import spring_mass_chain
 from bayes_nlsid.structure.modal_model import joint_flexibility_ratio, modal_model

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+
 from bayes_nlsid.recordings.recording import Channel, Recording
 from bayes_nlsid.structure.beam import LappedBeam, lapped_beam
 from bayes_nlsid.structure.modal import ModalModel
@@ -94,7 +95,8 @@ def test_too_few_or_blind_sensors_are_refused_naming_modes(model: ModalModel) ->
     recording, _ = periodic(model, [0, 1, 2], ("S1", "S3"))
     with pytest.raises(ValueError, match=r"2 sensors cannot tell 3 modes apart \(1 \("):
         modal_data(recording, model, [0, 1, 2], (), (40.0, 900.0), noise=white(1e-6, 2))
-    twins = replace(model, locations=(*model.locations, "S1b"), shapes=np.vstack([model.shapes, 1.0001 * model.rows(["S1"])]), residual=None)
+    rows = np.vstack([model.shapes, 1.0001 * model.rows(["S1"])])
+    twins = replace(model, locations=(*model.locations, "S1b"), shapes=rows, residual=None)
     recording, _ = periodic(twins, [0, 1], ("S1", "S1b"))
     with pytest.raises(ValueError, match="modes 1 .* 2 .* cannot be told apart"):
         modal_data(recording, twins, [0, 1], (), (40.0, 900.0), noise=white(1e-6, 2))

@@ -251,7 +251,8 @@ def _bending(s: float, h: float, phi: float) -> tuple[NDArray[np.float64], ...]:
                   0, -(2 * s**3 - 3 * s**2 - phi * s), h * (s**3 - (1 - phi / 2) * s**2 - phi / 2 * s)]) / (1 + phi)
     w_x = np.array([0, (6 * s**2 - 6 * s - phi) / h, 3 * s**2 - (4 + phi) * s + 1 + phi / 2,
                     0, -(6 * s**2 - 6 * s - phi) / h, 3 * s**2 - (2 - phi) * s - phi / 2]) / (1 + phi)
-    rot = np.array([0, 6 / h * (s**2 - s), 3 * s**2 - (4 + phi) * s + 1 + phi, 0, -6 / h * (s**2 - s), 3 * s**2 - (2 - phi) * s]) / (1 + phi)
+    rot = np.array([0, 6 / h * (s**2 - s), 3 * s**2 - (4 + phi) * s + 1 + phi,
+                    0, -6 / h * (s**2 - s), 3 * s**2 - (2 - phi) * s]) / (1 + phi)
     rot_x = np.array([0, 6 / h * (2 * s - 1), 6 * s - 4 - phi, 0, -6 / h * (2 * s - 1), 6 * s - 2 + phi]) / (h * (1 + phi))
     return w, w_x, rot, rot_x
 
@@ -282,7 +283,8 @@ class _Mesh:
                   *(x for _, x, _ in beam.masses), *(beam.lap or ()), *(x + d for x in beam.stations for d in (-half, 0.0, half))]
         x = _divide(breaks, beam.element_size)
         spans = [(0.0, beam.length)] if beam.lap is None else [(0.0, beam.lap[1]), (beam.lap[0], beam.length)]
-        halves, names = [], []
+        halves: list[_Half] = []
+        names: list[str] = []
         for letter, sign, (start, stop) in zip("LR", (-1.0, 1.0), spans, strict=False):
             tiny = 1e-9 * beam.length
             inside = [i for i in range(len(x)) if start - tiny <= x[i] <= stop + tiny]

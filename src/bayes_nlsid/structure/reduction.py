@@ -130,14 +130,12 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
     T_s, S = _statics(structure.K, A, constraint)
     count = min(len(full.omega), len(names) - full.rigid.shape[1] + (0 if constraint is None else constraint.shape[0]))
     target = Modes(full.rigid, full.omega[:count], full.shapes[:, :count])
-    T, history = T_s, []
-    for step in range(iterations + 1):
-        if step:
-            T = T_s + S(structure.M @ (T @ np.linalg.solve(M_r, K_r)))
+    T, M_r, K_r = T_s, _project(structure.M, T_s), _project(structure.K, T_s)
+    history = [_compare(structure, target, T, M_r, K_r)]
+    while len(history) <= iterations and not _met(history[-1], tolerance, least_mac):
+        T = T_s + S(structure.M @ (T @ np.linalg.solve(M_r, K_r)))
         M_r, K_r = _project(structure.M, T), _project(structure.K, T)
         history.append(_compare(structure, target, T, M_r, K_r))
-        if _met(history[-1], tolerance, least_mac):
-            break
     status = "ok" if _met(history[-1], tolerance, least_mac) else _missed(history[-1], target, tolerance, least_mac)
     return Reduced(structure, names, T, M_r, K_r, tuple(history), float(np.linalg.cond(M_r)),
                    "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations", status, notes)

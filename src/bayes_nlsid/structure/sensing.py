@@ -120,8 +120,8 @@ def modal_filter(rows: NDArray[np.float64], noise: NDArray[np.float64], names: S
     """
     sensors, count = rows.shape
     if sensors < count:
-        raise ValueError(f"{sensors} sensors cannot tell {count} modes apart ({', '.join(names)}); observe at most {sensors} modes, or give "
-                         "well separated modes a band each")
+        raise ValueError(f"{sensors} sensors cannot tell {count} modes apart ({', '.join(names)}); observe at most {sensors} modes, or "
+                         "give well separated modes a band each")
     weight = 1 / np.sqrt(noise / noise.max()) if (noise > 0).all() else np.ones(sensors)
     weighted = rows * weight[:, None]
     _, values, directions = np.linalg.svd(weighted, full_matrices=False)

@@ -185,7 +185,13 @@ def modes(structure: Structure, count: int = 10) -> Modes:
 
 
 def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
-    """Modes of a pair of matrices that is already known to be symmetric, M positive definite, K positive semi-definite."""
+    """Modes of a pair of matrices that is already known to be symmetric, M positive definite, K positive semi-definite.
+
+    Raises
+    ------
+    ValueError
+        If rounding hides the gap between rigid-body and elastic modes.
+    """
     from scipy.linalg import eigh
 
     n = K.shape[0]
@@ -207,8 +213,11 @@ def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
     values, mixing = eigh(vectors.T @ (K @ vectors), vectors.T @ (M @ vectors))
     vectors = vectors @ mixing
     rigid = rigid_count(values, rounding(K, M))
+    if (values[rigid:] <= 0).any():
+        raise ValueError("rigid-body and elastic modes cannot be parted: stiffness spans too many orders of magnitude for double precision; "
+                         "lower the stiffest springs")
     elastic = slice(rigid, min(rigid + count, len(values)))
-    return Modes(vectors[:, :rigid], np.sqrt(np.maximum(values[elastic], 0.0)), vectors[:, elastic])
+    return Modes(vectors[:, :rigid], np.sqrt(values[elastic]), vectors[:, elastic])
 
 
 def rigid_count(values: NDArray[np.float64], noise: float) -> int:
