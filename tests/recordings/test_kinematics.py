@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bayes_nlsid.recordings.kinematics import Kinematics, band_pass, kinematics
+from bayes_nlsid.recordings.filtering import band_pass
+from bayes_nlsid.recordings.kinematics import Kinematics, kinematics
 from bayes_nlsid.recordings.recording import Channel, Quantity, Recording
 
 FS = 2048.0

@@ -13,12 +13,9 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayes_nlsid.recordings.filtering import agreeing, band_pass, extended, reach, rms, skirts, without_line
 from bayes_nlsid.recordings.recording import Channel, Recording
 
-LOWER_SKIRT = 0.5   # the pass band ends at this fraction of the lower edge
-UPPER_SKIRT = 1.25  # and at this multiple of the upper edge, or at the Nyquist frequency
-EDGE_TOLERANCE = 1e-3  # relative error that extension of a transient may leave in the samples called valid
-KERNEL_REACH = 8.0  # over the width (Hz) of the lower skirt: seconds after which the filter has forgotten
 ORDER = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
@@ -112,7 +109,7 @@ def kinematics(recording: Recording, band: tuple[float, float], fs: float | None
     """
     every = _decimation(recording, band, fs)
     rate = recording.fs / every
-    stop = (LOWER_SKIRT * band[0], min(UPPER_SKIRT * band[1], rate / 2))
+    stop = skirts(band, rate)
     if recording.n * recording.dt < 2 / band[0]:
         raise ValueError(f"recording {recording.name!r}: {recording.n * recording.dt:.3g} s hold fewer than two periods of the lower band "
                          f"edge {band[0]:g} Hz; raise the edge or record longer")
@@ -122,41 +119,13 @@ def kinematics(recording: Recording, band: tuple[float, float], fs: float | None
         keep, edge = slice(0, recording.n), np.zeros(len(order))
     else:
         motions, force, keep, edge = _transient(recording, order, band, stop)
-    noise = np.max([_ratio(np.sqrt(power), _rms(motion[keep]))
+    noise = np.max([_ratio(np.sqrt(power), rms(motion[keep]))
                     for power, motion in zip(_noise_power(recording, order, band, stop), motions, strict=True)], axis=0)
     displacement, velocity, acceleration = (m[::every] for m in motions)
     valid = slice(-(-keep.start // every), (keep.stop - 1) // every + 1)
     return Kinematics(recording.name, recording.dt * every, displacement, velocity, acceleration, force[::every], valid, band,
                       np.minimum(np.hypot(noise, edge), 1.0), recording.channels, recording.inputs,
                       None if recording.period is None else recording.period // every, stop)
-
-
-def band_pass(frequency: ArrayLike, band: tuple[float, float], stop: tuple[float, float]) -> NDArray[np.float64]:
-    """Gain of a filter that is one inside ``band``, zero outside ``stop``, and infinitely smooth between.
-
-    Parameters
-    ----------
-    frequency : array_like
-        Hz, any shape.
-    band, stop : tuple of float
-        (low, high) Hz with stop[0] ≤ band[0] < band[1] ≤ stop[1].
-
-    Returns
-    -------
-    ndarray
-        Same shape, 0 to 1.
-    """
-    f = np.abs(np.asarray(frequency, dtype=float))
-    return _step(f, stop[0], band[0]) * (1 - _step(f, band[1], stop[1]))
-
-
-def _step(f: NDArray[np.float64], start: float, end: float) -> NDArray[np.float64]:
-    """Smooth step of all orders from 0 at ``start`` to 1 at ``end``: 1 / (1 + exp(1/x − 1/(1−x)))."""
-    if end <= start:
-        return np.asarray(f > end, dtype=float)
-    x = np.clip((f - start) / (end - start), 1e-9, 1 - 1e-9)
-    value = 1 / (1 + np.exp(np.clip(1 / x - 1 / (1 - x), -700, 700)))
-    return np.where(f <= start, 0.0, np.where(f >= end, 1.0, value))
 
 
 def _decimation(recording: Recording, band: tuple[float, float], fs: float | None) -> int:
@@ -195,50 +164,19 @@ def _transient(recording: Recording, order: NDArray[np.int_], band: tuple[float,
     from scipy.fft import next_fast_len
 
     n, dt = recording.n, recording.dt
-    reach = round(KERNEL_REACH / ((band[0] - stop[0]) * dt))
-    total = next_fast_len(n + 2 * reach, real=True)
-    response, force = _detrend(recording.response), _detrend(recording.force)
+    far = reach(band, dt)
+    total = next_fast_len(n + 2 * far, real=True)
+    response, force = without_line(recording.response), without_line(recording.force)
     runs = []
     for odd in (False, True):
-        motions, filtered = _filtered(_extend(response, reach, total - n - reach, odd), _extend(force, reach, total - n - reach, odd),
+        motions, filtered = _filtered(extended(response, far, total - n - far, odd), extended(force, far, total - n - far, odd),
                                       order, dt, band, stop)
-        runs.append((tuple(m[reach:reach + n] for m in motions), filtered[reach:reach + n]))
+        runs.append((tuple(m[far:far + n] for m in motions), filtered[far:far + n]))
     (motions, filtered), (others, other) = runs
     floor = [np.sqrt(power) for power in _noise_power(recording, order, band, stop)] + [np.zeros(force.shape[1])]
-    keep = _keep([*motions, filtered], [*others, other], floor, min(reach, n // 3))
-    edge = np.max([_ratio(_rms(a[keep] - b[keep]), _rms(a[keep])) for a, b in zip(motions, others, strict=True)], axis=0)
+    keep = agreeing([*motions, filtered], [*others, other], floor, min(far, n // 3))
+    edge = np.max([_ratio(rms(a[keep] - b[keep]), rms(a[keep])) for a, b in zip(motions, others, strict=True)], axis=0)
     return motions, filtered, keep, edge
-
-
-def _keep(ones: list[NDArray[np.float64]], others: list[NDArray[np.float64]], floor: list[NDArray[np.float64]], reach: int) -> slice:
-    """The samples where two continuations agree: to `EDGE_TOLERANCE` of the motion near that end, or a third of its noise."""
-    n, edges = len(ones[0]), []
-    for part in (slice(0, reach), slice(n - 1, n - 1 - reach, -1)):
-        last = 0
-        for one, other, noise in zip(ones, others, floor, strict=True):
-            allowed = np.maximum(EDGE_TOLERANCE * _rms(one[part]), noise / 3)
-            beyond = np.flatnonzero((np.abs(one[part] - other[part]) > allowed).any(axis=1))
-            last = max(last, int(beyond[-1]) + 1 if beyond.size else 0)
-        edges.append(last)
-    return slice(edges[0], n - edges[1])
-
-
-def _detrend(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Without its straight line, which lies below any band and would only be spread by the ends."""
-    t = np.linspace(-1, 1, len(x))
-    return np.asarray(x - x.mean(axis=0) - np.outer(t, t @ x / (t @ t)), dtype=float)
-
-
-def _extend(x: NDArray[np.float64], before: int, after: int, odd: bool) -> NDArray[np.float64]:
-    """Continued on both sides by its mirror image, even, or odd about its end points, fading out smoothly."""
-    parts = []
-    for values, count in ((x, before), (x[::-1], after)):
-        used = min(count, len(x) - 1)
-        mirror = 2 * values[0] - values[1:used + 1] if odd else values[1:used + 1]
-        part = np.zeros((count, x.shape[1]))
-        part[:used] = mirror * (1 - _step(np.arange(1, used + 1, dtype=float), 0.0, used + 1.0))[:, None]
-        parts.append(part)
-    return np.concatenate([parts[0][::-1], x, parts[1]])
 
 
 def _noise_power(recording: Recording, order: NDArray[np.int_], band: tuple[float, float], stop: tuple[float, float],
@@ -252,7 +190,7 @@ def _noise_power(recording: Recording, order: NDArray[np.int_], band: tuple[floa
     if recording.period is not None:
         window, signal = np.ones(n), recording.response - recording.response.mean(axis=0)
     else:
-        window, signal = np.hanning(n + 2)[1:-1], _detrend(recording.response)
+        window, signal = np.hanning(n + 2)[1:-1], without_line(recording.response)
     spectrum = np.fft.rfft(signal * window[:, None], axis=0)
     psd = 2 * dt * np.abs(spectrum) ** 2 / (window @ window)
     f = np.fft.rfftfreq(n, dt)
@@ -264,11 +202,6 @@ def _noise_power(recording: Recording, order: NDArray[np.int_], band: tuple[floa
     gain = band_pass(f, band, stop)
     omega = 2 * np.pi * np.where(gain > 0, f, 1.0)[:, None]
     return [np.sum(level * gain[:, None] ** 2 * omega ** (2.0 * (k - order)), axis=0) * (f[1] - f[0]) for k in (0, 1, 2)]
-
-
-def _rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean square over time."""
-    return np.asarray(np.sqrt(np.mean(x**2, axis=0)), dtype=float)
 
 
 def _ratio(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
