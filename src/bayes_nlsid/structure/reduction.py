@@ -40,6 +40,8 @@ class Reduced:
     condition : float
         Condition number of M.
     method : str
+    rigid : int
+        Number of rigid-body modes the coordinates can move in.
     status : str
         ``"ok"``, or in words which modes are not met.
     notes : tuple of str
@@ -53,6 +55,7 @@ class Reduced:
     history: tuple[Step, ...]
     condition: float
     method: str
+    rigid: int = 0
     status: str = "ok"
     notes: tuple[str, ...] = ()
 
@@ -67,7 +70,7 @@ class Reduced:
 
     def modes(self, count: int = 10) -> Modes:
         """Rigid and lowest elastic modes of the reduced model, shapes in the coordinates of the full model (N, m)."""
-        small = eigenmodes(self.K, self.M, min(count, self.size))
+        small = eigenmodes(self.K, self.M, min(count, self.size), self.rigid)
         return Modes(self.T @ small.rigid, small.omega, self.T @ small.shapes)
 
 
@@ -128,17 +131,18 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
     full = modes(structure, compare)
     constraint, notes = _unseen(structure, A, full.rigid, guard)
     T_s, S = _statics(structure.K, A, constraint)
-    count = min(len(full.omega), len(names) - full.rigid.shape[1] + (0 if constraint is None else constraint.shape[0]))
+    rigid = full.rigid.shape[1] - (0 if constraint is None else constraint.shape[0])
+    count = min(len(full.omega), len(names) - rigid)
     target = Modes(full.rigid, full.omega[:count], full.shapes[:, :count])
     T, M_r, K_r = T_s, _project(structure.M, T_s), _project(structure.K, T_s)
-    history = [_compare(structure, target, T, M_r, K_r)]
+    history = [_compare(structure, target, T, (M_r, K_r), rigid)]
     while len(history) <= iterations and not _met(history[-1], tolerance, least_mac):
         T = T_s + S(structure.M @ (T @ np.linalg.solve(M_r, K_r)))
         M_r, K_r = _project(structure.M, T), _project(structure.K, T)
-        history.append(_compare(structure, target, T, M_r, K_r))
+        history.append(_compare(structure, target, T, (M_r, K_r), rigid))
     status = "ok" if _met(history[-1], tolerance, least_mac) else _missed(history[-1], target, tolerance, least_mac)
     return Reduced(structure, names, T, M_r, K_r, tuple(history), float(np.linalg.cond(M_r)),
-                   "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations", status, notes)
+                   "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations", rigid, status, notes)
 
 
 def without_rigid_body(reduced: Reduced) -> Reduced:
@@ -146,7 +150,7 @@ def without_rigid_body(reduced: Reduced) -> Reduced:
 
     Elastic frequencies are unchanged; the coordinates z have no names of their own.
     """
-    rigid = eigenmodes(reduced.K, reduced.M, 1).rigid
+    rigid = eigenmodes(reduced.K, reduced.M, 1, reduced.rigid).rigid
     if rigid.shape[1] == 0:
         return reduced
     from scipy.linalg import null_space
@@ -154,7 +158,7 @@ def without_rigid_body(reduced: Reduced) -> Reduced:
     L = null_space(rigid.T @ reduced.M)
     M, K = L.T @ reduced.M @ L, L.T @ reduced.K @ L
     return replace(reduced, masters=tuple(f"z{i + 1}" for i in range(L.shape[1])), T=reduced.T @ L, M=0.5 * (M + M.T), K=0.5 * (K + K.T),
-                   condition=float(np.linalg.cond(M)), method=reduced.method + ", rigid-body motion removed")
+                   condition=float(np.linalg.cond(M)), rigid=0, method=reduced.method + ", rigid-body motion removed")
 
 
 def static_flexibility(structure: Structure, rows: ArrayLike, rigid: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -250,9 +254,10 @@ def _project(matrix: Matrix, T: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(0.5 * (product + product.T), dtype=float)
 
 
-def _compare(structure: Structure, target: Modes, T: NDArray[np.float64], M_r: NDArray[np.float64], K_r: NDArray[np.float64]) -> Step:
+def _compare(structure: Structure, target: Modes, T: NDArray[np.float64], reduced: tuple[NDArray[np.float64], NDArray[np.float64]],
+             rigid: int) -> Step:
     """Each full mode against the reduced mode that resembles it most."""
-    small = eigenmodes(K_r, M_r, len(M_r))
+    small = eigenmodes(reduced[1], reduced[0], len(reduced[0]), rigid)
     if len(small.omega) == 0 or len(target.omega) == 0:
         return Step(np.full(len(target.omega), np.inf), np.zeros(len(target.omega)))
     likeness = mac(target.shapes, T @ small.shapes, structure.M)

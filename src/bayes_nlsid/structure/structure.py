@@ -184,8 +184,10 @@ def modes(structure: Structure, count: int = 10) -> Modes:
     return eigenmodes(structure.K, structure.M, count)
 
 
-def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
+def eigenmodes(K: Matrix, M: Matrix, count: int, rigid: int | None = None) -> Modes:
     """Modes of a pair of matrices that is already known to be symmetric, M positive definite, K positive semi-definite.
+
+    ``rigid`` is the number of rigid-body modes where it is known beforehand, as it is for reduced matrices, whose own rounding is worse.
 
     Raises
     ------
@@ -212,10 +214,10 @@ def eigenmodes(K: Matrix, M: Matrix, count: int) -> Modes:
     vectors = vectors / np.sqrt(np.einsum("ij,ij->j", vectors, M @ vectors))
     values, mixing = eigh(vectors.T @ (K @ vectors), vectors.T @ (M @ vectors))
     vectors = vectors @ mixing
-    rigid = rigid_count(values, rounding(K, M))
+    rigid = rigid_count(values, rounding(K, M)) if rigid is None else rigid
     if (values[rigid:] <= 0).any():
-        raise ValueError("rigid-body and elastic modes cannot be parted: stiffness spans too many orders of magnitude for double precision; "
-                         "lower the stiffest springs")
+        raise ValueError("rigid-body and elastic modes cannot be parted: stiffness spans too many orders of magnitude for double "
+                         "precision; lower the stiffest springs")
     elastic = slice(rigid, min(rigid + count, len(values)))
     return Modes(vectors[:, :rigid], np.sqrt(values[elastic]), vectors[:, elastic])
 
