@@ -47,11 +47,12 @@ def _cache_directory(source: str) -> str:
 def compiled(function: Callable[..., Any]) -> Any:
     """The function compiled by numba, kept on disk if a directory can be written, else compiled anew in each process."""
     directory = _cache_directory(inspect.getfile(function))
-    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, directory
+    settings: Any = numba.config
+    before, settings.CACHE_DIR = settings.CACHE_DIR, directory
     try:
         return numba.njit(cache=bool(directory), error_model="numpy")(function)
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 @numba.extending.overload(laws.where, strict=False)
@@ -60,21 +61,18 @@ def _scalar_where(condition: Any, yes: Any, no: Any) -> Any:
     return lambda condition, yes, no: yes if condition else no
 
 
-def _usable(function: Callable[..., Any]) -> Any:
-    """Let compiled code call a plain Python function."""
-    return numba.extending.register_jitable(function)
-
-
-for _function in (memory.turning_point, memory.slider_step, memory.bouc_wen_step, memory.bouc_wen_slope):
-    _usable(_function)
+for _block in (memory.turning_point, memory.slider_step, memory.bouc_wen_step, memory.bouc_wen_slope):
+    numba.extending.register_jitable(_block)  # compiled code may call it, and compiles it from here
 
 # --- laws by number -----------------------------------------------------------------------------------------------------------
 
-_FAMILIES = (laws.displacement_odd, laws.displacement_even, laws.mixed_odd, laws.mixed_even, laws.velocity_odd, laws.velocity_even)
-_PLAIN = (laws.spring, laws.dashpot, laws.jenkins, laws.jenkins_prager, laws.clearance, laws.iwan4, laws.iwan5)
-for _function in (*_FAMILIES, *_PLAIN):
-    _usable(_function)
-    _usable(getattr(laws, f"{_function.__name__}_slope"))
+_FAMILIES: tuple[Callable[..., Any], ...] = (laws.displacement_odd, laws.displacement_even, laws.mixed_odd, laws.mixed_even,
+                                             laws.velocity_odd, laws.velocity_even)
+_PLAIN: tuple[Callable[..., Any], ...] = (laws.spring, laws.dashpot, laws.jenkins, laws.jenkins_prager, laws.clearance, laws.iwan4,
+                                          laws.iwan5)
+for _law in (*_FAMILIES, *_PLAIN):
+    numba.extending.register_jitable(_law)
+    numba.extending.register_jitable(getattr(laws, f"{_law.__name__}_slope"))
 
 
 def law_code(term: Term) -> tuple[int, float] | None:
@@ -274,13 +272,16 @@ def march_sliders(moves: NDArray[np.float64], stiffness: NDArray[np.float64], sl
                   theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Slider forces (B, N) along moves (N,); stiffness, slip (B, sliders), theta (B,)."""
     batch, count = slip.shape
-    force = np.zeros((batch, len(moves)))
+    force = np.empty((batch, len(moves)))
     for b in range(batch):
-        for j in range(count):
-            stretch, sliding = 0.0, 0.0
-            for i in range(len(moves)):
-                stretch, sliding = memory.slider_step(moves[i], stretch, sliding, slip[b, j], theta[b])
-                force[b, i] += stiffness[b, j] * stretch
+        stretch, sliding = np.zeros(count), np.zeros(count)
+        for i in range(len(moves)):
+            for j in range(count):
+                stretch[j], sliding[j] = memory.slider_step(moves[i], stretch[j], sliding[j], slip[b, j], theta[b])
+            total = 0.0
+            for j in range(count):
+                total += stiffness[b, j] * stretch[j]
+            force[b, i] = total
     return force
 
 

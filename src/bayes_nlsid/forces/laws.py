@@ -3,8 +3,8 @@
 Every law is ``law(q, v, *p) -> force`` and every slope ``slope(q, v, *p) -> (df/dq, df/dv)`` in m, m/s, N. They use only numpy
 functions that act element by element and never branch on data, so the same Python function broadcasts over any batch and
 compiles as it stands for scalars (``forces/compiled.py``); all stand at module level, so that terms can be sent to other
-processes. Monomials take their exponent last, and ``forces/library.py`` binds it. Slopes are finite everywhere: 0 where the derivative is not.
-Either entry of a slope may be the plain number 0.0, which broadcasts.
+processes. Monomials take their exponent last, and ``forces/library.py`` binds it. Slopes are finite everywhere: 0 where the
+derivative is not. Either entry of a slope may be the plain number 0.0, which broadcasts.
 
 Iwan laws are written with the slip ratio r = |q|/phi_max as load over capacity, never as a division by phi_max: with
 beta → 0 and chi → −1 phi_max itself leaves the range of double precision while force and slope stay finite.

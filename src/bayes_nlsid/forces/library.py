@@ -28,7 +28,7 @@ from functools import partial
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.forces import laws
 from bayes_nlsid.forces.parameter import Param
-from bayes_nlsid.forces.term import Confidence, Law, Term
+from bayes_nlsid.forces.term import Confidence, Law, Slope, Term
 
 PAPER = "Safari and Londoño Monsalve 2023, Table 1"
 SLIP = Param("f_s", "N", "force", meaning="force at which the whole contact slips")
@@ -60,7 +60,7 @@ def _power(symbol: str, power: float, odd: bool) -> str:
     return f"sign({symbol})*{size}" if odd else size
 
 
-def _bound(family: str, power: float, odd: bool) -> tuple[Law, Law]:
+def _bound(family: str, power: float, odd: bool) -> tuple[Law, Slope]:
     """Law and slope of a monomial with its exponent bound."""
     name = f"{family}_{'odd' if odd else 'even'}"
     return partial(getattr(laws, name), power=float(power)), partial(getattr(laws, f"{name}_slope"), power=float(power))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,7 @@ Memory = Literal["none", "masing", "sliders", "bouc_wen"]
 Parity = Literal["odd", "even", "none"]
 Confidence = Literal["H", "M", "L", "-"]
 Law = Callable[..., NDArray[np.float64]]
+Slope = Callable[..., tuple[Any, Any]]
 
 
 @final
@@ -36,6 +37,7 @@ class Term:
         memory it is the *backbone* (``masing``, ``sliders``: first loading curve) or the instantaneous part (``bouc_wen``).
     slope : callable
         ``slope(q, v, *p) -> (df/dq, df/dv)`` of ``law``, in the same style; finite everywhere (0 where the derivative is not).
+        Either may be a plain number, to be broadcast.
     stiffness : callable or None
         ``stiffness(*p)``: the spring at rest f'(0), N/m, that a linear model of the stuck joint already contains; None if zero.
     memory : {"none", "masing", "sliders", "bouc_wen"}
@@ -63,7 +65,7 @@ class Term:
     formula: str
     params: tuple[Param, ...]
     law: Law
-    slope: Law
+    slope: Slope
     memory: Memory = "none"
     stiffness: Law | None = None
     index: int | None = None
