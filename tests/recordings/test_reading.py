@@ -35,7 +35,7 @@ def npz_bytes(**arrays: Any) -> bytes:
 def mat_bytes(compressed: bool = True) -> bytes:
     stream = io.BytesIO()
     run = {"acc": ACC, "meta": {"force": FORCE[None], "who": "someone"}}
-    savemat(stream, {"run": run, "fs": RATE, "t": TIME}, do_compression=compressed)
+    savemat(stream, {"run": run, "fs": RATE, "file": TIME}, do_compression=compressed)
     return stream.getvalue()
 
 
@@ -73,7 +73,8 @@ def test_npz_to_si(write: Write) -> None:
     data = npz_bytes(acc=ACC.astype("f4"), force=FORCE[:, None], time=TIME + 20, words=np.array(["a"]))
     run = read_recording(RecordingSpec(write("a.npz", data), "run", CHANNELS, role="holdout", time="time", period=16))
     assert run.dt == pytest.approx(1 / RATE, rel=1e-12) and run.start == 20 and run.period == 16 and run.role == "holdout"
-    assert np.allclose(run.response[:, 0], -9.80665 * ACC[:, 2].astype("f4").astype(float), rtol=1e-12) and np.array_equal(run.force[:, 0], FORCE)
+    assert np.allclose(run.response[:, 0], -9.80665 * ACC[:, 2].astype("f4").astype(float), rtol=1e-12)
+    assert np.array_equal(run.force[:, 0], FORCE)
     assert [c.name for c in run.channels] == ["tip"] and run.channels[0].unit == "g" and run.inputs[0].location == "P3"
     assert run.sha256 == hashlib.sha256(data).hexdigest()
 
@@ -247,10 +248,7 @@ GOOD = {"a.npz": npz_bytes(acc=ACC[:8], force=FORCE[:8]), "a.csv": csv_bytes()[:
         "a.mat": mat_bytes(), "b.mat": mat_bytes(False), "c.mat": hdf5_bytes()}
 
 
-@pytest.mark.parametrize("name", GOOD)
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, name: str, data: st.DataObject) -> None:
+def damage(tmp_path: Path, name: str, data: st.DataObject) -> None:
     damaged = bytearray(GOOD[name])
     for at, value in data.draw(st.lists(st.tuples(st.integers(0, len(damaged) - 1), st.integers(0, 255)), max_size=4)):
         damaged[at] = value
@@ -265,8 +263,34 @@ def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, name: str, data: 
     assert np.isfinite(run.response).all()
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.binary(max_size=300), suffix=st.sampled_from([".npz", ".csv", ".txt", ".mat"]))
+def few(count: int) -> settings:
+    return settings(max_examples=count, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.mark.parametrize("name", [n for n in GOOD if not n.endswith(".mat")])
+@few(80)
+@given(data=st.data())
+def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    damage(tmp_path, name, data)
+
+
+@pytest.mark.parametrize("name", [n for n in GOOD if n.endswith(".mat")])
+@few(4)  # each starts a process
+@given(data=st.data())
+def test_damaged_matlab_files_raise_input_errors_only(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    damage(tmp_path, name, data)
+
+
+def test_a_parser_that_crashes_is_an_unreadable_file(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    crash = tmp_path / "crash.py"
+    crash.write_text("import os\nos.abort()\n")
+    monkeypatch.setattr(readers, "MATLAB_PARSER", crash)
+    with pytest.raises(InputError, match="its structure is broken"):
+        read_file(write("a.mat", mat_bytes()))
+
+
+@few(80)
+@given(data=st.binary(max_size=300), suffix=st.sampled_from([".npz", ".csv", ".txt"]))
 def test_arbitrary_bytes_raise_input_errors_only(tmp_path: Path, data: bytes, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
