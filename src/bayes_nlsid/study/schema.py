@@ -84,7 +84,8 @@ class IdentificationEntry:
     """``[identification]``: Sections 2.2 and 2.3.
 
     ``modes``, ``main`` and ``free_modes`` are 1-based. ``candidates`` are names of terms with groups already spelled out; empty means
-    that the form is known (``elements``). ``output_error`` refines the regression by least squares on the simulated response.
+    that the form is known (``elements``). ``band`` (Hz) bounds the residual, ``rate`` (Hz) lowers the sampling, ``mode_bands`` gives
+    each mode a filter of its own. ``output_error`` refines the regression by least squares on the simulated response.
     """
 
     scenario: str = "S2"
@@ -103,18 +104,23 @@ class IdentificationEntry:
     eps2: float | None = None
     starts: int = 50
     rate: float | None = None
+    mode_bands: tuple[tuple[float, float], ...] = ()
+    static_correction: bool = False
     output_error: bool = False
 
 
 @final
 @dataclass(frozen=True)
 class UserTermEntry:
-    """``[[terms]]``: a term of the user's own, from a checked expression."""
+    """``[[terms]]``: a term of the user's own, from a checked expression.
+
+    ``params``: name and (unit, rule) or (unit, rule, lower, upper) of each coefficient.
+    """
 
     name: str
     formula: str
-    params: tuple[tuple[tuple[str, Any], ...], ...]
-    parity: str | None = None
+    params: tuple[tuple[str, tuple[Any, ...]], ...]
+    memory: Literal["none", "masing"] = "none"
     meaning: str = ""
 
 

@@ -1,0 +1,5 @@
+"""``python -m bayes_nlsid``."""
+
+from bayes_nlsid.cli import main
+
+raise SystemExit(main())

@@ -1,0 +1,188 @@
+"""The command ``nlsid``: a study from the command line. Nothing heavy is imported before it is needed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayes_nlsid import __version__
+from bayes_nlsid.errors import InputError
+
+DONE, REFUSED, BAD_INPUT, STOPPED = 0, 1, 2, 130
+_ABSENT = {
+    "compare": "the comparison of scenarios",
+    "montecarlo": "Monte Carlo sensitivity",
+    "frf": "stepped-sine response curves by continuation",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns
+    -------
+    int
+        0 done; 1 done, but the answer is a refusal; 2 bad input; 130 stopped.
+    """
+    try:
+        options = _parser().parse_args(arguments)
+        status: int = options.action(options)
+        sys.stdout.flush()
+        return status
+    except InputError as error:
+        print(f"nlsid: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("\nnlsid: stopped; run the same command again to go on from here.", file=sys.stderr)
+        return STOPPED
+    except BrokenPipeError:  # the reader of our output (head, less) has gone
+        sys.stderr.close()
+        return DONE
+
+
+def _parser() -> argparse.ArgumentParser:
+    top = argparse.ArgumentParser(prog="nlsid", description="Nonlinear models of jointed structures from recordings, with their uncertainty.",
+                                  epilog="Exit status: 0 done, 1 done but the answer is a refusal (the reason is printed and stored), "
+                                         "2 bad input, 130 stopped.")
+    top.add_argument("--version", action="version", version=f"bayes_nlsid {__version__}")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    common = _common()
+
+    def add(name: str, summary: str, action: Any, out: bool = False) -> argparse.ArgumentParser:
+        parser = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".", parents=[common])
+        parser.set_defaults(action=action, command=name)
+        if out:
+            parser.add_argument("--out", required=True, metavar="DIR", help="results folder")
+        return parser
+
+    run = add("run", "all stages of a study, resuming where an earlier run stopped", _run, out=True)
+    run.add_argument("study", metavar="STUDY.toml")
+    run.add_argument("--fresh", action="store_true", help="compute every stage again")
+    check = add("check", "read everything, say what would be done and what is missing; compute nothing", _check)
+    check.add_argument("study", metavar="STUDY.toml")
+    diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
+    diagnose.add_argument("study", metavar="PATH", help="study file or case folder")
+    for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),
+                       ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
+                       ("frf", "stepped-sine response curves with posterior bands")):
+        add(name, f"{what} (not in this version)", _absent, out=True).add_argument("study", metavar="STUDY.toml")
+    report = add("report", "write report.html again from stored results", _report)
+    report.add_argument("out", metavar="DIR")
+    add("terms", "the library of force laws as a table", _terms)
+    add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses)
+    add("new", "write a commented study to start from", _new).add_argument("out", metavar="DIR")
+    return top
+
+
+def _common() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    group = common.add_argument_group("common options")
+    group.add_argument("--seed", type=_whole, metavar="N", help="in place of the seed of the study")
+    group.add_argument("--workers", type=_positive, default=1, metavar="N", help="threads or processes; results do not depend on it")
+    group.add_argument("--executor", type=_executor, default="local", metavar="local|dask://HOST:PORT", help="where the work is done")
+    group.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    group.add_argument("--log", metavar="FILE", help="also write the log here")
+    return common
+
+
+def _whole(text: str) -> int:
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 up")
+    return int(text)
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 up")
+    return int(text)
+
+
+def _executor(text: str) -> str:
+    if text == "local":
+        return text
+    if text.startswith("dask://"):
+        raise argparse.ArgumentTypeError("dask executors are not in this version; use --executor local with --workers N")
+    raise argparse.ArgumentTypeError(f"{text!r} is neither local nor dask://HOST:PORT")
+
+
+def _reporter(options: argparse.Namespace, out: Path) -> Any:
+    from bayes_nlsid.study.progress import Reporter
+
+    terminal = sys.stderr if sys.stderr.isatty() and not options.quiet else None
+    logs = [out / "run.log"]
+    if options.log:
+        extra = Path(options.log)
+        if not extra.parent.is_dir():
+            raise InputError(f"--log {options.log}", f"there is no folder {extra.parent}", "create it or choose another file")
+        logs.append(extra)
+    return Reporter(tuple(logs), terminal)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.reading import read_study
+    from bayes_nlsid.study.run import run_study
+
+    study, out = read_study(options.study), Path(options.out)
+    result = run_study(study, out, seed=options.seed, workers=options.workers, fresh=options.fresh, reporter=_reporter(options, out))
+    if not options.quiet:
+        from bayes_nlsid.study.screen import summary
+
+        print(summary(result, out))
+    elif result["status"] != "ok":
+        print(f"nlsid: {result['status']}: {'; '.join(result['reasons'])}", file=sys.stderr)
+    return DONE if result["status"] == "ok" else REFUSED
+
+
+def _check(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.reading import read_study
+    from bayes_nlsid.study.screen import plan
+
+    print(plan(read_study(options.study)))
+    return DONE
+
+
+def _report(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.run import rebuild_report
+
+    rebuild_report(Path(options.out))
+    if not options.quiet:
+        print(f"wrote {Path(options.out) / 'report.html'}")
+    return DONE
+
+
+def _terms(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.screen import terms_table
+
+    print(terms_table())
+    return DONE
+
+
+def _new(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.template import write_template
+
+    path = write_template(Path(options.out))
+    if not options.quiet:
+        print(f"wrote {path} and an example recording beside it\nnext: nlsid check {path}")
+    return DONE
+
+
+def _diagnose(options: argparse.Namespace) -> int:
+    return _not_here(options, "the mismatch engine")
+
+
+def _hypotheses(options: argparse.Namespace) -> int:
+    return _not_here(options, "the catalogue of hypotheses")
+
+
+def _absent(options: argparse.Namespace) -> int:
+    return _not_here(options, _ABSENT[options.command])
+
+
+def _not_here(options: argparse.Namespace, what: str) -> int:
+    print(f"nlsid {options.command}: {what} is not part of version {__version__}.", file=sys.stderr)
+    return BAD_INPUT
+
+

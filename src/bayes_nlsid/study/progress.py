@@ -1,0 +1,86 @@
+"""What a run tells while it works: a line that renews itself on a terminal, and a log file always."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TextIO, final
+
+Progress = Callable[[float, str], None]
+
+
+def duration(seconds: float) -> str:
+    """``75`` → ``1 min 15 s``."""
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+@final
+class Reporter:
+    """Progress of a run.
+
+    Parameters
+    ----------
+    logs : tuple of Path
+        Files that every finished step is appended to.
+    terminal : TextIO or None
+        Where the renewing line goes; None for silence (not a terminal, or ``--quiet``).
+    """
+
+    def __init__(self, logs: tuple[Path, ...] = (), terminal: TextIO | None = None) -> None:
+        self._logs, self._terminal = logs, terminal
+        self._label, self._began, self._shown = "", time.monotonic(), 0.0
+        self._width = 0
+
+    def begin(self, number: int, count: int, stage: str, why: str) -> None:
+        """A stage starts; ``why`` says what makes it necessary."""
+        self._label, self._began = f"[{number}/{count}] {stage}", time.monotonic()
+        self._record(f"{self._label}: begun ({why})")
+        self._line(f"{self._label} ...")
+
+    def update(self, share: float, sentence: str) -> None:
+        """Part of the current stage is done (0 to 1)."""
+        now = time.monotonic()
+        if now - self._shown < 0.1 and share < 1:
+            return
+        self._shown = now
+        spent = now - self._began
+        rest = f", about {duration(spent * (1 - share) / share)} left" if 0.02 < share < 1 and spent > 2 else ""
+        self._line(f"{self._label} {100 * min(max(share, 0.0), 1.0):3.0f} %{rest}  {sentence}")
+
+    def end(self, seconds: float, reused: bool) -> None:
+        """The current stage is finished."""
+        text = f"{self._label}: " + ("taken from an earlier run" if reused else f"done in {duration(seconds)}")
+        self._record(text)
+        self._line(text)
+        if self._terminal is not None:
+            self._terminal.write("\n")
+            self._terminal.flush()
+        self._width = 0
+
+    def note(self, sentence: str) -> None:
+        """A sentence worth keeping."""
+        self._record(sentence)
+        if self._terminal is not None:
+            self._line("")
+            self._terminal.write(f"\r  {sentence}\n")
+            self._terminal.flush()
+            self._width = 0
+
+    def _line(self, text: str) -> None:
+        if self._terminal is None:
+            return
+        shown = text[:118]
+        self._terminal.write("\r" + shown + " " * max(0, self._width - len(shown)))
+        self._terminal.flush()
+        self._width = len(shown)
+
+    def _record(self, text: str) -> None:
+        for path in self._logs:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")

@@ -1,0 +1,193 @@
+"""A study file to a checked `Study`: every mistake is one sentence with file, key and mend."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
+from bayes_nlsid.recordings.units import unit_factor
+from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
+from bayes_nlsid.study.reading_structure import read_reduction, read_structure
+from bayes_nlsid.study.schema import LinearEntry, Study
+from bayes_nlsid.study.store import file_digest
+from bayes_nlsid.study.table import Table, nearest
+
+ROLES = ("train", "holdout", "noise", "linear")
+QUANTITIES = ("acceleration", "velocity", "displacement", "force")
+
+
+def read_study(path: Path | str) -> Study:
+    """Read and check a study file, and that everything it names exists.
+
+    Parameters
+    ----------
+    path : Path or str
+        TOML file; other files are named relative to it.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    InputError
+        On the first thing that cannot be used.
+    """
+    file = Path(path)
+    top = Table(file, "", _parse(file))
+    title = top.text("title")
+    seed = top.integer("seed", 0)
+    outline = top.table("structure")
+    if outline is None:
+        raise InputError(f"{file.name}: [structure]", "is missing", 'add [structure] with kind = "beam", "matrices" or "oscillator"')
+    structure, locations = read_structure(outline)
+    reduction = read_reduction(top.table("reduction"), structure)
+    terms = read_terms(top)
+    recordings = _read_recordings(top, locations)
+    linear = _read_linear(top.table("linear"), recordings)
+    identification = read_identification(top.table("identification"), locations, terms)
+    posterior = read_posterior(top.table("posterior"))
+    names = tuple(r.name for r in recordings)
+    prediction = read_prediction(top.table("prediction"), locations, names)
+    report = read_report(top.table("report"))
+    top.close()
+    _check_order(file, identification is not None, posterior is not None, prediction is not None, recordings)
+    files = dict.fromkeys([*(p for _, p in structure.files), *(Path(r.file) for r in recordings)])
+    inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
+    return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
+                 report, locations, ((file.name, file_digest(file)), *inputs))
+
+
+def _parse(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(str(file), "there is no such file", "give the path of a study file, or make one with nlsid new DIR") from None
+    except IsADirectoryError:
+        raise InputError(str(file), "is a folder", "give the study file inside it, for instance study.toml") from None
+    except PermissionError:
+        raise InputError(str(file), "cannot be read", "change its permissions") from None
+    except UnicodeDecodeError:
+        raise InputError(str(file), "is not UTF-8 text", "save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(file), f"is not valid TOML: {error}", "correct that line") from None
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return path.relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return path.as_posix()
+
+
+def _check_order(file: Path, identification: bool, posterior: bool, prediction: bool, recordings: Sequence[RecordingSpec]) -> None:
+    """A stage needs the one before it."""
+    needs = [("posterior", posterior, "identification", identification), ("prediction", prediction, "identification", identification)]
+    for asked, present, needed, there in needs:
+        if present and not there:
+            raise InputError(f"{file.name}: [{asked}]", f"needs a table [{needed}], which is missing", f"add [{needed}] or remove [{asked}]")
+    if identification and not any(r.role == "train" for r in recordings):
+        raise InputError(f"{file.name}: [[recordings]]", 'none has role = "train", so there is nothing to identify from',
+                         'give one of them role = "train"')
+
+
+def _read_recordings(top: Table, locations: Sequence[str]) -> tuple[RecordingSpec, ...]:
+    entries: list[RecordingSpec] = []
+    for table in top.tables("recordings"):
+        entry = _read_recording(table, entries, locations)
+        if any(entry.name == other.name for other in entries):
+            raise table.wrong("name", f"{entry.name!r} is used twice", "give every recording a name of its own")
+        entries.append(entry)
+    if not entries:
+        raise InputError(f"{top.file.name}: [[recordings]]", "there is none", "add at least one [[recordings]] entry")
+    return tuple(entries)
+
+
+def _read_recording(table: Table, earlier: Sequence[RecordingSpec], locations: Sequence[str]) -> RecordingSpec:
+    """One entry; ``like`` takes over file, clock, window and channels of an earlier one."""
+    like = table.text("like", None)
+    base = next((r for r in earlier if r.name == like), None)
+    if like is not None and base is None:
+        raise table.wrong("like", f"{like!r} is not a recording above", nearest(like, [r.name for r in earlier]))
+    file = table.path("file") if base is None else table.path("file", Path(base.file))
+    name = table.text("name", file.stem)
+    role = table.text("role", "train", ROLES)
+    rate, time = _read_clock(table, base)
+    time_unit = table.text("time_unit", base.time_unit if base else "s")
+    period = table.integer("period", None, low=2)
+    start = table.number("start", "time", base.start if base else None)
+    window = table.span("window", "time", base.window if base else None)
+    channels = tuple(_read_channel(c, locations) for c in table.tables("channels"))
+    if not channels and base is None:
+        raise table.wrong("channels", "there is none", f"add [[recordings.channels]] for every signal of {file.name} to be used")
+    channels = channels or (base.channels if base is not None else ())
+    table.close()
+    try:
+        return RecordingSpec(str(file), name, channels, role, rate, time, time_unit, window, period, start)
+    except InputError as error:
+        raise InputError(f"{table.file.name}: {table.name} {error.where}", error.problem, error.mend) from None
+
+
+def _read_clock(table: Table, base: RecordingSpec | None) -> tuple[float | str | None, str | None]:
+    """``rate`` as a number (Hz), a text with its unit, or the name of the array that holds it; or ``time``, the name of an array."""
+    has_rate, has_time = table.has("rate"), table.has("time")
+    if has_rate and has_time:
+        raise table.wrong("time", "is given beside rate", "keep one of them")
+    if has_time:
+        return None, table.text("time")
+    if has_rate:
+        value = table.raw("rate")
+        if isinstance(value, str) and not value.strip()[:1].isdigit():
+            return value, None
+        return table.number("rate", "frequency", positive=True), None
+    if base is not None:
+        return base.rate, base.time
+    raise table.wrong("rate", "is missing", 'add rate = 12800 (Hz), rate = "name of the array that holds it", or time = "name"')
+
+
+def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
+    quantity, unit = table.text("quantity", choices=QUANTITIES), table.text("unit")
+    per_volt = table.number("per_volt", default=None)
+    volts = unit.strip().endswith("V")
+    if volts and per_volt is None:
+        raise table.wrong("unit", f"{unit!r} is a voltage and the quantity is {quantity}",
+                          "add per_volt = ... , what one volt stands for in SI, or give the unit of the quantity")
+    if per_volt is not None and not volts:
+        raise table.wrong("per_volt", f"is given beside unit {unit!r}", "give unit V or mV, or drop per_volt")
+    try:
+        unit_factor(unit, "voltage" if volts else quantity)
+    except InputError as error:
+        raise table.wrong("unit", f"{unit!r} {error.problem}", error.mend) from None
+    location = table.text("location")
+    if location not in locations:
+        raise table.wrong("location", f"{location!r} is not a location of the structure", nearest(location, locations))
+    polarity = table.integer("polarity", 1, low=-1, high=1)
+    name = table.text("name", location if quantity != "force" else f"force at {location}")
+    array, column = table.text("array"), table.integer("column", None)
+    if polarity == 0 or per_volt == 0:
+        key = "polarity" if polarity == 0 else "per_volt"
+        raise table.wrong(key, "is 0", "write 1, or -1 for a sensor mounted the other way round" if key == "polarity" else "give the sensitivity")
+    table.close()
+    return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt)
+
+
+def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec]) -> LinearEntry:
+    if table is None:
+        return LinearEntry()
+    names = [r.name for r in recordings]
+    recording = table.text("recording", None)
+    if recording is not None and recording not in names:
+        raise table.wrong("recording", f"there is no recording {recording!r}", nearest(recording, names))
+    update = table.texts("update", ())
+    entry = LinearEntry(recording, table.span("window", "time", None), table.integers("modes", ()), update,
+                        table.numbers("damping", "ratio", ()), table.flag("use_measured", True))
+    if update and recording is None:
+        raise table.wrong("update", "names parts to update, but no recording to take modes from", 'add recording = "name"')
+    if any(not 0 < z < 1 for z in entry.damping):
+        raise table.wrong("damping", f"{list(entry.damping)} holds a ratio outside 0 to 1", 'write ratios such as 0.001 or "0.1 %"')
+    table.close()
+    return entry

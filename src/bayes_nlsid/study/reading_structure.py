@@ -1,0 +1,148 @@
+"""``[structure]`` and ``[reduction]`` of a study file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.structure.beam import LappedBeam
+from bayes_nlsid.study.building import build_structure
+from bayes_nlsid.study.schema import ReductionEntry, StructureEntry
+from bayes_nlsid.study.table import Table, nearest
+
+_DIMENSION = {
+    "length": "length", "width": "length", "height": "length", "E": "pressure", "rho": "density", "nu": "number", "G": "pressure",
+    "shear_factor": "number", "element_size": "length", "lap": "length", "stations": "length", "patch": "length",
+    "tangential": "stiffness", "normal": "stiffness", "rotation": "rotational stiffness",
+}
+_SERIES = ("lap", "stations")
+_PLACES = ("sensors", "inputs", "points")
+_SPRINGS = ("tangential", "normal", "rotation")
+GROUPS = ("sensors", "inputs", "joints")
+
+
+def read_structure(table: Table) -> tuple[StructureEntry, tuple[str, ...]]:
+    """The structure's entry and the names of all its locations; the structure is built once to be sure that it can be.
+
+    Raises
+    ------
+    InputError
+        If a key is wrong, or the builder refuses the values.
+    """
+    kind = table.text("kind", choices=("beam", "matrices", "oscillator"))
+    read: dict[str, Callable[[Table], StructureEntry]] = {"beam": _beam, "matrices": _matrices, "oscillator": _oscillator}
+    entry = read[kind](table)
+    table.close()
+    try:
+        built = build_structure(entry)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{table.file.name}: {table.name}", str(error), "correct these values") from None
+    return entry, tuple(built.locations)
+
+
+def _beam(table: Table) -> StructureEntry:
+    values: dict[str, Any] = {}
+    for spec in fields(LappedBeam):
+        name = spec.name
+        default = None if spec.default is not MISSING else _required(table, name)
+        if name in _PLACES:
+            value: Any = _positions(table, name)
+        elif name in ("boundary", "side"):
+            value = table.text(name, None)
+        elif name == "bolts":
+            value = tuple((t.number("at", "length"), t.number("mass", "mass")) for t in _closing(table, name, ("at", "mass")))
+        elif name == "masses":
+            value = tuple((t.text("name"), t.number("at", "length"), t.number("mass", "mass")) for t in _closing(table, name, ("name", "at", "mass")))
+        elif name in _SERIES:
+            value = table.numbers(name, _DIMENSION[name], default)
+        elif name in _SPRINGS:
+            value = _springs(table, name)
+        else:
+            value = table.number(name, _DIMENSION.get(name, "number"), default)
+        if value is not None and value != ():
+            values[name] = value
+    if "lap" in values and len(values["lap"]) != 2:
+        raise table.wrong("lap", f"{len(values['lap'])} values are given", "write lap = [start, end]")
+    return StructureEntry("beam", tuple(values.items()))
+
+
+def _required(table: Table, name: str) -> None:
+    """Raise the sentence of a missing key."""
+    if not table.has(name):
+        table.raw(name)
+
+
+def _closing(table: Table, key: str, known: tuple[str, ...]) -> list[Table]:
+    """Inner tables, each closed against unknown keys before its values are taken."""
+    inner = list(table.tables(key))
+    for one in inner:
+        for name in known:
+            one.has(name)
+        one.close()
+    return inner
+
+
+def _springs(table: Table, name: str) -> Any:
+    """One stiffness, one for each station, or false to leave the direction out."""
+    value = table.raw(name, None)
+    if value is None:
+        return None
+    if value is False:
+        return False
+    many = table.numbers(name, _DIMENSION[name])
+    return many if isinstance(value, list) else many[0]
+
+
+def _positions(table: Table, name: str) -> tuple[tuple[str, float], ...]:
+    """``[structure.sensors]``: name = position."""
+    inner = table.table(name)
+    return () if inner is None else tuple((key, inner.number(key, "length")) for key in inner.keys())
+
+
+def _matrices(table: Table) -> StructureEntry:
+    """One npz in the form of a case's ``nominal.npz``, or MatrixMarket files for mass and stiffness."""
+    if table.has("file"):
+        return StructureEntry("matrices", (), (("file", table.path("file")),))
+    files: list[tuple[str, Path]] = [("mass", table.path("mass")), ("stiffness", table.path("stiffness"))]
+    if table.has("names"):
+        files.append(("names", table.path("names")))
+    values: dict[str, Any] = {key: table.texts(key, ()) for key in GROUPS}
+    rows = table.table("locations")
+    if rows is not None:
+        values["locations"] = tuple((key, rows.numbers(key)) for key in rows.keys())
+    return StructureEntry("matrices", tuple(values.items()), tuple(files))
+
+
+def _oscillator(table: Table) -> StructureEntry:
+    """Mass with stiffness or frequency, damping coefficient or ratio."""
+    mass = table.number("mass", "mass", 1.0, positive=True)
+    if table.has("stiffness") == table.has("frequency"):
+        raise table.wrong("stiffness", "and frequency must not both be given or both be missing", "give one of them")
+    if table.has("damping") and table.has("zeta"):
+        raise table.wrong("damping", "and zeta are both given", "keep one of them")
+    values = {"mass": mass, "stiffness": table.number("stiffness", "stiffness", None, positive=True),
+              "frequency": table.number("frequency", "frequency", None, positive=True), "damping": table.number("damping", "damping", None),
+              "zeta": table.number("zeta", "ratio", None), "location": table.text("location", "x"), "sensors": table.texts("sensors", None),
+              "inputs": table.texts("inputs", None)}
+    return StructureEntry("oscillator", tuple((k, v) for k, v in values.items() if v is not None))
+
+
+def read_reduction(table: Table | None, structure: StructureEntry) -> ReductionEntry:
+    """``[reduction]``; the default keeps the full model."""
+    if table is None:
+        return ReductionEntry()
+    method = table.text("method", "none", ("none", "guyan", "iirs"))
+    if structure.kind == "oscillator" and method != "none":
+        raise table.wrong("method", "an oscillator has nothing to reduce", 'remove [reduction] or write method = "none"')
+    masters = table.texts("masters", GROUPS)
+    entry = ReductionEntry(method, masters, table.integer("modes", None, low=1), table.integer("iterations", 30, low=1),
+                           table.number("damping", "ratio", 1e-3, positive=True))
+    if method == "none" and table.has("masters"):
+        raise table.wrong("masters", "is given, but method is none", f"write a method ({nearest('iirs', ('guyan', 'iirs'))}), or remove masters")
+    table.close()
+    return entry

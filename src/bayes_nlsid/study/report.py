@@ -1,0 +1,166 @@
+"""The report: one page that tells what was found, how sure it is and what to do next, then shows the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any, final
+
+from bayes_nlsid.study import report_page as html
+from bayes_nlsid.study.axes import engineering, unit_sign
+from bayes_nlsid.study.pictures import Picture
+from bayes_nlsid.study.progress import duration
+from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.store import Saved
+from bayes_nlsid.study.story import STATUS_WORDS, story
+
+
+@final
+@dataclass(frozen=True)
+class Report:
+    """All that a report is made of.
+
+    Parameters
+    ----------
+    study : Study
+    done : dict of str to Saved
+    result : dict
+        What ``result.json`` holds.
+    pictures : tuple of Picture
+    text : str
+        The study file as it was run.
+    """
+
+    study: Study
+    done: Mapping[str, Saved]
+    result: Mapping[str, Any]
+    pictures: tuple[Picture, ...]
+    text: str = ""
+
+
+def render(report: Report) -> str:
+    """The page as HTML, without any outside resource."""
+    status = str(report.result["status"])
+    badge = f'<span class="badge {"ok" if status == "ok" else "warn"}">{escape(STATUS_WORDS[status])}</span>'
+    sections: list[tuple[str, str, Callable[[Report], str]]] = [
+        ("recordings", "Recordings", _recordings), ("linear", "Linear model", _linear), ("selection", "Which force laws", _selection),
+        ("posterior", "Parameters and their uncertainty", _posterior), ("prediction", "What the model predicts", _prediction),
+        ("provenance", "Where every number comes from", _provenance)]
+    parts = [(name, title, make(report) + _figures(report, name)) for name, title, make in sections]
+    parts = [part for part in parts if part[2]]
+    links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title, _ in parts)
+    told = "".join(html.paragraph(sentence) for sentence in story(report.study, report.result))
+    body = [f'<p class="soft">bayes_nlsid {escape(str(report.result["versions"].get("bayes_nlsid", "")))}, seed {report.result["seed"]}</p>',
+            f"<h1>{escape(report.study.title)}</h1>", f"<p>{badge}</p>", f'<div class="story">{told}</div>', f"<nav>{links}</nav>"]
+    body += [f'<section id="{name}"><h2>{escape(title)}</h2>{content}</section>' for name, title, content in parts]
+    return html.page(report.study.title, "\n".join(body))
+
+
+def _figures(report: Report, section: str) -> str:
+    return "".join(html.picture(p.png, p.caption, f"{p.source}; figures/{p.name}.png", p.caption.split(":")[0])
+                   for p in report.pictures if p.section == section)
+
+
+def _recordings(report: Report) -> str:
+    saved = report.done.get("read")
+    if saved is None:
+        return ""
+    rows, findings = [], []
+    for record in saved.data["recordings"]:
+        for channel in record["channels"]:
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
+                         f"{channel['peak']:.3g} {unit_sign(channel['unit'])}", f"{channel['noise_rms']:.2g} {unit_sign(channel['unit'])}"])
+        for channel in record["inputs"]:
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
+                         f"{channel['peak']:.3g} N", "–"])
+        findings += [f"{record['name']}, {f['channel']}: {f['sentence']}" if f["channel"] else f"{record['name']}: {f['sentence']}"
+                     for f in record["findings"]]
+    head = ["recording", "role", "channel", "location", "length", "rate", "peak", "noise (rms)"]
+    how = list(dict.fromkeys(f"Noise floor: {r['noise']}" for r in saved.data["recordings"]))
+    return html.table(head, rows, "stages/read", numeric=(4, 5, 6, 7)) + html.listing(findings) + "".join(html.paragraph(h, "soft") for h in how[:3])
+
+
+def _linear(report: Report) -> str:
+    saved = report.done.get("linear")
+    if saved is None:
+        return ""
+    rows = [[str(m["number"]), f"{m['measured_hz']:.4g} ± {m['measured_sd']:.1g}", "–" if m["stated_hz"] is None else f"{m['stated_hz']:.4g}",
+             f"{m['model_hz']:.4g}", f"{100 * (m['model_hz'] / m['measured_hz'] - 1):+.2f} %", f"{100 * m['zeta']:.3g} ± {100 * m['zeta_sd']:.1g} %",
+             f"{m['mac']:.3f}", m["status"]] for m in saved.data["modes"]]
+    head = ["mode", "measured (Hz)", "as stated (Hz)", "updated (Hz)", "error left", "damping", "MAC", "remark"]
+    out = html.table(head, rows, "stages/linear; ± one standard deviation", numeric=(1, 2, 3, 4, 5, 6))
+    scaled = [[u["part"], f"× {u['factor']:.4g}", f"{100 * u['log_sd']:.2g} %"] for u in saved.data["updated"]]
+    out += html.table(["part of the structure", "scaled by", "standard deviation"], scaled, "stages/linear", numeric=(1, 2))
+    out += html.listing([f"Polarity: {p['sentence']}" for p in saved.data["polarity"]])
+    return out + html.listing(saved.data["notes"])
+
+
+def _selection(report: Report) -> str:
+    saved = report.done.get("identify")
+    if saved is None:
+        return ""
+    rows = []
+    for record in saved.data["variants"]:
+        terms = "; ".join(f"{e['term']} at {', '.join(e['locations'])}" for e in record["elements"]) or "none (linear)"
+        share = 1 - record["mse"] / record["mse_linear"] if record["mse_linear"] > 0 else 0.0
+        rows.append([record["name"], terms, f"{record['mse_linear']:.3g}", f"{record['mse']:.3g}", f"{record['floor']:.2g}", f"{100 * share:.1f} %",
+                     record["status"]])
+    head = ["form", "force laws", "mean square, linear", "with them", "noise floor", "explained", "fit"]
+    out = html.table(head, rows, f"stages/identify, scenario {saved.data['scenario']}", numeric=(2, 3, 4, 5))
+    steps = [[record["name"], s["action"], s["element"], f"{s['mse']:.4g}", "yes" if s["accepted"] else "no", s["reason"]]
+             for record in saved.data["variants"] for s in record.get("path", [])]
+    if steps:
+        steps_table = html.table(["form", "round", "candidate", "mean square", "accepted", "why"], steps, "stages/identify", numeric=(3,))
+        out += f"<details open><summary>Every round of the selection</summary>{steps_table}</details>"
+    alike = [f"{r['name']}: the recordings do not tell {', '.join(r['aliases'])} from what was chosen" for r in saved.data["variants"] if r.get("aliases")]
+    return out + html.listing(alike)
+
+
+def _posterior(report: Report) -> str:
+    rows = []
+    for p in report.result.get("parameters", []):
+        u = p["unit"]
+        quantiles = [engineering(p[q], u, 4) if p.get(q) is not None else "–" for q in ("q05", "q50", "q95")]
+        known = "–" if "identifiable" not in p else "yes" if p["identifiable"] else "no: as wide as assumed"
+        rows.append([p["name"], engineering(p["fit"], u, 4) if p["fit"] is not None else "–", *quantiles, known,
+                     "–" if p.get("ess") is None else f"{p['ess']:.0f}"])
+    head = ["parameter", "least squares", "5 %", "50 %", "95 %", "identifiable", "effective draws"]
+    out = html.table(head, rows, "stages/identify, stages/posterior (posterior.nc)", numeric=(1, 2, 3, 4, 6))
+    saved = report.done.get("posterior")
+    if saved is None:
+        return out
+    c = saved.data["convergence"]
+    facts = [["ensembles × steps", f"{c['ensembles']} × {c['steps']}"], ["converged", "yes" if c["converged"] else "no"],
+             ["largest R-hat over ensembles", f"{c['rhat_max']:.4f}" if c["rhat_max"] is not None else "–"],
+             ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"], ["stuck walkers", str(c["stuck_walkers"])]]
+    out += html.table(["sampler", ""], facts, "stages/posterior")
+    priors = [[p["parameter"], p["text"]] for p in saved.data.get("priors", [])]
+    return out + f"<details><summary>What was assumed beforehand (priors)</summary>{html.table(['parameter', 'prior'], priors, 'stages/posterior')}</details>"
+
+
+def _prediction(report: Report) -> str:
+    saved = report.done.get("predict")
+    if saved is None:
+        return ""
+    rows = [[e["record"], f"{100 * e['nrmse']:.3g} %", f"{100 * e['nrmse_linear']:.3g} %" if e.get("nrmse_linear") is not None else "–",
+             f"{100 * e['noise_floor']:.2g} %", f"{100 * e['coverage90']:.0f} %", engineering(e["rmse"], e["unit"]) if e.get("rmse") is not None else "–"]
+            for e in saved.data.get("heldout", [])]
+    out = html.table(["record not fitted", "NRMSE", "linear model", "noise floor", "inside 90 % band", "RMSE"], rows, "stages/predict",
+                     numeric=(1, 2, 3, 4, 5))
+    published = [[p.label, "–" if p.frequency is None else f"{p.frequency[0]:g}–{p.frequency[1]:g} Hz",
+                  "–" if p.damping is None else f"{100 * p.damping[0]:.3g}–{100 * p.damping[1]:.3g} %", p.text] for p in report.study.report.published]
+    out += html.table(["published by others", "frequency", "damping", ""], published, "the study file")
+    return out + html.listing(saved.data.get("notes", []))
+
+
+def _provenance(report: Report) -> str:
+    stages = [[name, duration(s.seconds), s.key[:16], f"stages/{name}/", s.versions.get("numpy", "–"), s.versions.get("python", "–")]
+              for name, s in report.done.items()]
+    out = html.table(["stage", "took", "hash of inputs", "files", "numpy", "python"], stages, "stages/*/stage.json", hashes=(2,))
+    out += html.table(["input file", "SHA-256"], [[n, h] for n, h in report.study.inputs], "the study file", hashes=(1,))
+    versions = [[name, str(value)] for name, value in report.result["versions"].items()]
+    out += html.table(["package", "version"], versions, "the run that wrote this report")
+    if report.text:
+        out += f"<details><summary>The study file</summary><pre>{escape(report.text)}</pre></details>"
+    return out

@@ -1,0 +1,147 @@
+"""All stages of a study, each skipped when nothing it depends on has changed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.study.archive import keep_study, stored_study, study_text
+from bayes_nlsid.study.context import Context, Result
+from bayes_nlsid.study.progress import Reporter
+from bayes_nlsid.study.report import Report, render
+from bayes_nlsid.study.schema import STAGES, Study
+from bayes_nlsid.study.store import Saved, Store, write_atomic
+from bayes_nlsid.study.summary import summarise, to_text
+
+# a stage is a pure function of the context: what it returns is stored, and stored results are all that later stages see
+_STAGES = {stage: (f"bayes_nlsid.study.stage_{stage}", stage) for stage in STAGES if stage != "report"}
+
+
+def _stage(name: str) -> Callable[[Context], Result]:
+    """The function of a stage; imported when it is needed, so that a run that skips the sampler never loads it."""
+    module, function = _STAGES[name]
+    found: Callable[[Context], Result] = getattr(import_module(module), function)
+    return found
+
+
+def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers: int = 1, fresh: bool = False,
+              reporter: Reporter | None = None) -> dict[str, Any]:
+    """Run every stage the study names and write the files of the results folder.
+
+    Parameters
+    ----------
+    study : Study
+    out : Path or str
+        Results folder; what it already holds is reused where its inputs are unchanged.
+    seed : int, optional
+        In place of the study's own.
+    workers : int
+        Processes or threads within a stage; the results do not depend on it.
+    fresh : bool
+        Compute everything again.
+    reporter : Reporter, optional
+
+    Returns
+    -------
+    dict
+        What ``result.json`` holds.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be carried out as written, another run holds the folder, or the disk is full.
+    KeyboardInterrupt
+        Passed on; finished stages and sampler checkpoints stay, and the next run goes on from them.
+    """
+    store = Store(out)
+    with store.lock():
+        store.sweep()
+        keep_study(store.stages, study, study.seed if seed is None else seed)
+        told = reporter if reporter is not None else Reporter((store.out / "run.log",))
+        context = Context(study, study.seed if seed is None else seed, workers, {}, told.update, told.note, store.scratch)
+        for number, name in enumerate(study.stages, start=1):
+            if name == "report":
+                told.begin(number, len(study.stages), name, "always written anew")
+                began = time.monotonic()
+                result = finish(store, study, context.done, context.seed, told)
+                told.end(time.monotonic() - began, reused=False)
+            else:
+                context.done[name] = _one(store, context, name, (number, len(study.stages)), fresh, told)
+    return result
+
+
+def _one(store: Store, context: Context, name: str, place: tuple[int, int], fresh: bool, told: Reporter) -> Saved:
+    """One stage: from disk if it is there, else computed and stored."""
+    key = context.key(name)
+    why = "asked for by --fresh" if fresh else store.why_redo(name, key)
+    told.begin(*place, name, why or "unchanged")
+    if not why:
+        saved = store.load(name)
+        if saved is not None:
+            told.end(saved.seconds, reused=True)
+            return saved
+    if fresh:
+        store.clear_scratch(name)
+    began = time.monotonic()
+    arrays, data = _stage(name)(context)
+    saved = store.save(name, key, arrays, data, time.monotonic() - began, context.inputs(name))
+    store.clear_scratch(name)
+    told.end(saved.seconds, reused=False)
+    return saved
+
+
+def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: Reporter | None = None) -> dict[str, Any]:
+    """Write ``result.json``, ``posterior.nc``, ``backbone.npz``, the figures and the report from stored stages."""
+    from bayes_nlsid.study.pictures import draw_all
+
+    result = summarise(study, done, seed)
+    write_atomic(store.out / "result.json", to_text(result).encode())
+    if "posterior" in done:
+        from bayes_nlsid.study.stage_posterior import write_inference_data
+
+        write_inference_data(done["posterior"], store.out / "posterior.nc")
+    if "predict" in done and "amplitude" in done["predict"].arrays:
+        _write_backbone(done["predict"], store.out / "backbone.npz")
+    pictures = draw_all(study, done, told.update if told is not None else (lambda share, sentence: None))
+    folder = store.out / "figures"
+    folder.mkdir(exist_ok=True)
+    for picture in pictures:
+        write_atomic(folder / f"{picture.name}.png", picture.png)
+    write_atomic(store.out / "report.html", render(Report(study, dict(done), result, tuple(pictures), study_text(store.out))).encode())
+    return result
+
+
+def _write_backbone(saved: Saved, path: Path) -> None:
+    """The arrays of the contract, with the backbone measured directly beside them."""
+    from io import BytesIO
+
+    import numpy as np
+
+    wanted = ("amplitude", *(f"{q}_{level}" for q in ("frequency", "damping") for level in ("q05", "q50", "q95")), "samples_frequency",
+              "samples_damping", "numerical_error_frequency")
+    arrays = {name: saved.arrays[name] for name in wanted}
+    arrays |= {name.replace("measured.", "measured_"): a for name, a in saved.arrays.items() if name.startswith("measured.")}
+    buffer = BytesIO()
+    np.savez(buffer, **arrays)
+    write_atomic(path, buffer.getvalue())
+
+
+def rebuild_report(out: Path | str) -> dict[str, Any]:
+    """Write the report again from stored results; the study file is read from where the last run left a copy.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no results.
+    """
+    if not Path(out).is_dir():
+        raise InputError(str(out), "there is no such folder", "give the --out of an earlier nlsid run")
+    study, seed = stored_study(Path(out))
+    store = Store(out)
+    with store.lock():
+        done = {name: saved for name in study.stages if (saved := store.load(name)) is not None}
+        return finish(store, study, done, seed)

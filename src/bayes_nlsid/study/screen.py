@@ -1,0 +1,95 @@
+"""Text for the terminal: the plan of a study, its results on one screen, the library as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bayes_nlsid.study.axes import engineering
+from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.story import STATUS_WORDS
+
+WIDTH = 100
+
+
+def columns(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """A table in plain text."""
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+
+    def line(cells: Sequence[str]) -> str:
+        return "  ".join(c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))).rstrip()
+
+    return "\n".join([line(head), line(["-" * w for w in widths]), *map(line, rows)])
+
+
+def _wrapped(text: str) -> str:
+    from textwrap import fill
+
+    return fill(text, WIDTH)
+
+
+def summary(result: Mapping[str, Any], out: Path) -> str:
+    """One screen: what was found, parameters with 5/50/95 %, convergence, held-out error, files."""
+    parts = [f"{result['title']}: {STATUS_WORDS[result['status']]}"]
+    parts += [_wrapped(f"  reason: {reason}") for reason in result["reasons"][:4]]
+    rows = []
+    for p in result.get("parameters", []):
+        quantiles = [engineering(p[q], p["unit"], 4) if p.get(q) is not None else "-" for q in ("q05", "q50", "q95")]
+        fitted = engineering(p["fit"], p["unit"], 4) if p["fit"] is not None else "-"
+        rows.append([p["name"], fitted, *quantiles, "" if p.get("identifiable", True) else "not identifiable"])
+    if rows:
+        shown = rows[:16] + ([[f"... {len(rows) - 16} more in result.json", "", "", "", "", ""]] if len(rows) > 16 else [])
+        parts.append("\n" + columns(["parameter", "fit", "5 %", "50 %", "95 %", ""], shown, right=(1, 2, 3, 4)))
+    c = result.get("convergence")
+    if c:
+        rhat = "-" if c["rhat_max"] is None else f"{c['rhat_max']:.3f}"
+        ess = "-" if c["ess_min"] is None else f"{c['ess_min']:.0f}"
+        parts.append(f"\nsampler: {c['ensembles']} ensembles x {c['steps']} steps, {'converged' if c['converged'] else 'NOT converged'}, "
+                     f"R-hat {rhat}, effective draws {ess}, stuck walkers {c['stuck_walkers']}")
+    h = result.get("heldout") or {}
+    if h.get("nrmse") is not None:
+        parts.append(f"held out ({', '.join(h['records'])}): NRMSE {100 * h['nrmse']:.3g} %, noise floor {100 * h['noise_floor']:.2g} %, "
+                     f"90 % band covers {100 * h['coverage90']:.0f} %")
+    files = ", ".join(name for name in ("report.html", "result.json", "posterior.nc", "backbone.npz", "figures/", "run.log") if (out / name).exists())
+    return "\n".join([*parts, f"\nin {out}: {files}"])
+
+
+def plan(study: Study) -> str:
+    """What a run would do."""
+    parts = [f"{study.title} ({study.file.name}): everything it names is there and readable.", ""]
+    rows = [[r.name, r.role, Path(r.file).name, ", ".join(c.name for c in r.channels),
+             "whole file" if r.window is None else f"{r.window[0]:g}-{r.window[1]:g} s"] for r in study.recordings]
+    parts += [columns(["recording", "role", "file", "channels", "window"], rows), "", "stages: " + " -> ".join(study.stages)]
+    parts.append(_wrapped(f"structure: {study.structure.kind}, locations {', '.join(study.locations)}"))
+    entry = study.identification
+    if entry is not None:
+        what = f"{len(entry.candidates)} candidate terms at {', '.join(entry.joints)}" if entry.candidates else "known form " + "; ".join(
+            f"{e.term} at {', '.join(e.locations)}" for e in entry.elements)
+        parts.append(_wrapped(f"identification: scenario {entry.scenario}, modes {', '.join(map(str, entry.modes))}, {what}"))
+        parts += [_wrapped(f"  beside it: {a.name}, {len(a.candidates)} candidate terms") for a in entry.alternatives]
+    if study.posterior is not None:
+        parts.append(f"posterior: {study.posterior.ensembles} ensembles x {study.posterior.steps} steps, {study.posterior.likelihood} likelihood")
+    if study.prediction is not None:
+        p = study.prediction
+        parts.append(f"prediction: backbone of mode {p.mode} at {p.at} from {engineering(p.amplitude, 'm')}, {p.samples} samples; "
+                     f"held out: {', '.join(p.heldout) or 'none'}")
+    missing = [text for given, text in (
+        (study.linear.recording, "no low-level recording under [linear]: the linear model is used as stated"),
+        (study.identification, "no [identification]: only the linear model is made"),
+        (study.posterior, "no [posterior]: best values without uncertainty"),
+        (study.prediction and study.prediction.heldout, "no held-out record under [prediction]: nothing tests the prediction")) if not given]
+    return "\n".join([*parts, *(f"missing: {text}" for text in missing)])
+
+
+def terms_table() -> str:
+    """The library."""
+    from bayes_nlsid.forces.library import LIBRARY
+
+    rows = [["" if t.index is None else str(t.index), name, t.parity, t.memory, t.confidence,
+             ", ".join(f"{p.name} ({p.unit})" if p.unit else p.name for p in t.params),
+             t.formula if len(t.formula) <= 60 else t.meaning or f"{t.formula[:57]}..."] for name, t in LIBRARY.items()]
+    note = ("number: in Table 1 of Safari and Londoño Monsalve (2023); sure: how certain the reading of the printed table is (H, M, L).")
+    return columns(["number", "term", "parity", "memory", "sure", "parameters", "force"], rows, right=(0,)) + "\n\n" + _wrapped(note)
+
+

@@ -1,0 +1,130 @@
+"""Stage ``linear``: the structure as stated, the modes as measured at low level, and the model updated to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.recordings.recording import Recording
+from bayes_nlsid.structure.modal import ModalModel
+from bayes_nlsid.structure.structure import Structure, mac
+from bayes_nlsid.study.building import build_structure, model_record, reduce_structure
+from bayes_nlsid.study.context import Arrays, Context, Result
+
+
+def linear(context: Context) -> Result:
+    """Build, measure, update, reduce.
+
+    Returns
+    -------
+    arrays, data
+        ``model.*`` is the modal model for identification; ``data["modes"]`` compares measured and modelled modes, ``data["polarity"]`` names
+        channels whose sign disagrees, ``data["updated"]`` lists the parts that were scaled.
+    """
+    study = context.study
+    context.progress(0.0, "building the structure")
+    structure = build_structure(study.structure)
+    nominal = reduce_structure(structure, study.reduction)
+    if study.linear.recording is None:
+        model = _with_stated_damping(context, nominal)
+        arrays, names = model_record(model)
+        return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": [*model.notes, "no low-level recording was named"]}
+    from bayes_nlsid.structure.identify import identify_modes, polarity
+
+    context.progress(0.2, "identifying modes from low-level data")
+    wanted = tuple(k - 1 for k in study.linear.modes) or tuple(range(nominal.modes))
+    recording = _low_level(context)
+    measured = identify_modes(recording, nominal, modes=wanted)
+    signs = [{"channel": f.channel, "sentence": f.sentence} for f in polarity(measured, nominal)]
+    for sign in signs:
+        context.note(sign["sentence"])
+    updated: list[dict[str, Any]] = []
+    notes: list[str] = []
+    final = structure
+    if study.linear.update and isinstance(structure, Structure):
+        from bayes_nlsid.structure.updating import update
+
+        context.progress(0.6, "updating " + ", ".join(study.linear.update))
+        try:
+            found = update(structure, study.linear.update, measured)
+        except ValueError as error:
+            raise InputError(f"{study.file.name}: [linear] update", str(error), "name parts of the structure") from None
+        final = found.structure
+        updated = [{"part": name, "factor": float(value), "log_sd": float(sd)}
+                   for name, value, sd in zip(study.linear.update, np.atleast_1d(found.values), np.atleast_1d(found.sd), strict=True)]
+    context.progress(0.8, "reducing")
+    computed = reduce_structure(final, study.reduction)
+    model = _with_stated_damping(context, _measured_into(computed, measured, study.linear.use_measured))
+    arrays, names = model_record(model)
+    table, extra = _compare(measured, nominal, computed)
+    arrays |= extra
+    if study.structure.kind == "beam" and table:
+        arrays |= _shape_lines(context, updated, [row["number"] - 1 for row in table])
+    return arrays, {"model": names, "modes": table, "polarity": signs, "updated": updated, "shape_locations": list(measured.locations),
+                    "notes": [*model.notes, *measured.notes, *notes], "recording": recording.name}
+
+
+def _shape_lines(context: Context, updated: list[dict[str, Any]], modes: list[int]) -> Arrays:
+    """Mode shapes along the beam for the picture: the same beam with 41 more points, scaled like the model."""
+    entry = context.study.structure
+    values = entry.parameters
+    x = np.linspace(0.0, values["length"], 41)
+    points = (*values.get("points", ()), *((f"shape {i}", float(p)) for i, p in enumerate(x)))
+    structure = build_structure(replace(entry, values=tuple({**values, "points": points}.items())))
+    assert isinstance(structure, Structure)
+    if updated:
+        structure = structure.scaled({row["part"]: row["factor"] for row in updated})
+    fine = reduce_structure(structure, replace(context.study.reduction, method="none", masters=(), modes=max(modes) + 1))
+    return {"line_position": x, "line": fine.rows([f"shape {i}" for i in range(len(x))])[:, modes]}
+
+
+def _low_level(context: Context) -> Recording:
+    entry = context.study.linear
+    assert entry.recording is not None
+    recording = context.recordings[entry.recording]
+    return recording if entry.window is None else recording.window(*entry.window)
+
+
+def _with_stated_damping(context: Context, model: ModalModel) -> ModalModel:
+    """The model with the damping ratios that the study states; the first ones, mode by mode."""
+    stated = context.study.linear.damping
+    if not stated:
+        return model
+    if len(stated) > model.modes:
+        raise InputError(f"{context.study.file.name}: [linear] damping", f"{len(stated)} ratios are given for {model.modes} modes", "give fewer")
+    zeta = model.zeta.copy()
+    zeta[:len(stated)] = stated
+    return replace(model, zeta=zeta)
+
+
+def _measured_into(model: ModalModel, measured: Any, frequencies: bool) -> ModalModel:
+    """Measured damping, and frequencies if asked for, in place of the computed ones."""
+    from bayes_nlsid.structure.modal_model import with_damping
+
+    return with_damping(model, measured, measured_frequencies=frequencies)
+
+
+def _compare(measured: Any, nominal: ModalModel, computed: ModalModel) -> tuple[list[dict[str, Any]], Arrays]:
+    """Table and arrays of measured modes against the model before and after updating."""
+    from bayes_nlsid.structure.identified import pair
+
+    pairs = dict(pair(measured, computed))
+    before = dict(pair(measured, nominal))
+    kept = [i for i in range(measured.modes) if i in pairs]
+    rows = []
+    for i in kept:
+        k = pairs[i]
+        start = float(nominal.frequency[before[i]]) if i in before else None
+        rows.append({"number": k + 1, "measured_hz": float(measured.frequency[i]), "measured_sd": float(measured.frequency_sd[i]),
+                     "zeta": float(measured.zeta[i]), "zeta_sd": float(measured.zeta_sd[i]), "stated_hz": start,
+                     "model_hz": float(computed.frequency[k]), "amplitude_m": float(measured.amplitude[i]), "status": measured.status[i]})
+    at: NDArray[np.float64] = computed.rows(measured.locations)[:, [pairs[i] for i in kept]]
+    shapes = measured.shapes[:, kept]
+    likeness = mac(shapes, at)
+    for row, value in zip(rows, np.diag(likeness), strict=True):
+        row["mac"] = float(value)
+    return rows, {"mac": likeness, "measured_shapes": shapes, "model_at_sensors": at}

@@ -1,0 +1,83 @@
+"""Stage ``read``: recordings into SI, checked, with their noise floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.recordings.checks import check
+from bayes_nlsid.recordings.noise import noise_psd
+from bayes_nlsid.recordings.reading import RecordingSpec, read_recording
+from bayes_nlsid.recordings.recording import SI_UNIT, Recording
+from bayes_nlsid.study.axes import thinned
+from bayes_nlsid.study.context import Arrays, Context, Result
+
+MOST = 400_000
+"""Samples of a recording that are kept for its picture."""
+
+
+def read(context: Context) -> Result:
+    """Read every recording.
+
+    Returns
+    -------
+    arrays, data
+        ``<i>.noise_frequency`` (f,), ``<i>.noise_psd`` (f, s) for recording i; ``view<k>.signals`` (n, c) and ``view<k>.step`` for
+        every distinct set of signals, as pictures show them. ``data["recordings"]`` describes each recording.
+    """
+    arrays: Arrays = {}
+    records = []
+    noise_records = context.role("noise")
+    for i, recording in enumerate(context.recordings.values()):
+        context.progress(i / len(context.recordings), recording.name)
+        reference = next((r for r in noise_records if r.channels == recording.channels and r is not recording), None)
+        floor = noise_psd(recording, reference)
+        arrays[f"{i}.noise_frequency"], arrays[f"{i}.noise_psd"] = floor.frequency, floor.psd
+        records.append(_describe(recording, floor.rms(), floor.how))
+    views = _views(context, arrays)
+    return arrays, {"recordings": records, "views": views}
+
+
+def _describe(recording: Recording, noise: Any, how: str) -> dict[str, Any]:
+    channels = [{"name": c.name, "location": c.location, "quantity": c.quantity, "unit": SI_UNIT[c.quantity], "file_unit": c.unit,
+                 "polarity": c.polarity, "rms": float(np.std(recording.response[:, k])), "peak": float(np.abs(recording.response[:, k]).max()),
+                 "noise_rms": float(noise[k])} for k, c in enumerate(recording.channels)]
+    inputs = [{"name": c.name, "location": c.location, "unit": "N", "rms": float(np.std(recording.force[:, k])),
+               "peak": float(np.abs(recording.force[:, k]).max())} for k, c in enumerate(recording.inputs)]
+    findings = [{"severity": f.severity, "channel": f.channel, "sentence": f.sentence} for f in check(recording)]
+    return {"name": recording.name, "role": recording.role, "rate": recording.fs, "seconds": recording.n * recording.dt,
+            "start": recording.start, "period": recording.period, "sha256": recording.sha256, "channels": channels, "inputs": inputs,
+            "noise": how, "findings": findings, "notes": list(recording.notes)}
+
+
+def _views(context: Context, arrays: Arrays) -> list[dict[str, Any]]:
+    """One picture for every distinct set of signals: recordings that are windows of the same file share it."""
+    groups: dict[tuple[Any, ...], list[RecordingSpec]] = {}
+    for spec in context.study.recordings:
+        groups.setdefault((spec.file, spec.channels), []).append(spec)
+    names = list(context.recordings)
+    views = []
+    for k, specs in enumerate(groups.values()):
+        whole = _whole(specs[0], context)
+        step = thinned(whole.n, MOST)
+        signals = np.concatenate([whole.response, whole.force], axis=1)[step]
+        arrays[f"view{k}.signals"] = signals.astype(np.float32)
+        windows = [{"name": s.name, "role": s.role, "span": list(s.window or (0.0, whole.n * whole.dt))} for s in specs]
+        views.append({"title": ", ".join(s.name for s in specs), "step": whole.dt * (step.step or 1), "noise": names.index(specs[0].name),
+                      "labels": [c.name for c in (*whole.channels, *whole.inputs)],
+                      "units": [SI_UNIT[c.quantity] for c in whole.channels] + ["N"] * len(whole.inputs), "windows": windows,
+                      "responses": len(whole.channels)})
+    return views
+
+
+def _whole(spec: RecordingSpec, context: Context) -> Recording:
+    """The file without its window, if it can be read so (outside the window samples may be missing)."""
+    if spec.window is None:
+        return context.recordings[spec.name]
+    try:
+        return read_recording(replace(spec, window=None, period=None))
+    except InputError:
+        return context.recordings[spec.name]
