@@ -1,0 +1,458 @@
+"""Calibration of the linear model to a measured transfer function, globally.
+
+Poles of the measurement (vector fitting, started at the nominal poles) are paired with nominal modes by MAC, which brings the
+physical parameters into the right basin; then the transfer function itself is fitted, first coarsely, at last against its noise. Errors
+of single mode shapes at single sensors are random effects and are integrated out sensor by sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.linear import Attachment, Family, Fields, fields, jacobian, shape_columns, solve
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+RELATIVE_FLOOR = 7e-4
+
+
+@final
+@dataclass(frozen=True)
+class Chain:
+    """What the measuring chain does to the accelerance: H → (H ∘ factor) mix.
+
+    Parameters
+    ----------
+    factor : ndarray complex (L, S)
+    mix : ndarray (S, S) or None
+        Crosstalk: column s says what channel s picks up.
+    """
+
+    factor: Complex
+    mix: Array | None = None
+
+    def apply(self, values: Complex) -> Complex:
+        """(..., L, S) as the chain reports it."""
+        out = values * self.factor
+        return out if self.mix is None else out @ self.mix
+
+
+@final
+@dataclass(frozen=True)
+class Extension:
+    """Linear effects beside the family.
+
+    Parameters
+    ----------
+    x : ndarray (X,)
+        Their parameters, scaled so that 1 is a large change.
+    parts : callable
+        ``parts(x, s) -> (attachments, chain or None)``.
+    prior_sd : ndarray (X,)
+        Around ``centre``.
+    centre : ndarray (X,)
+    """
+
+    x: Array
+    parts: Callable[[Array, Complex], tuple[tuple[Attachment, ...], Chain | None]]
+    prior_sd: Array
+    centre: Array
+
+    def penalty(self, x: Array) -> float:
+        """Prior part of the cost."""
+        return float((((x - self.centre) / self.prior_sd) ** 2).sum())
+
+
+@final
+@dataclass(frozen=True)
+class LinearFit:
+    """A calibrated member of the family and the curvature around it.
+
+    Parameters
+    ----------
+    theta : ndarray (P,)
+    x : ndarray (X,)
+        Parameters of the extension (empty without one).
+    fields : Fields
+        Without shape errors and measuring chain.
+    model : ndarray complex (L, S)
+        Best prediction of the measurement, random effects and measuring chain included.
+    cost : float
+        −2 log posterior up to a constant: chi² + priors, random effects integrated out.
+    chi2 : float
+        The part of ``cost`` that is residual and random effects.
+    dof : int
+        Real data values.
+    normal : ndarray (P + X, P + X)
+        Curvature of cost/2, priors included.
+    shape_errors : ndarray (S, m)
+    s, measured, variance : lines, measured accelerance (L, S), its variance
+    system : System
+        The normal equations at the optimum.
+    rest : ndarray (P + X,)
+        Gradient of −cost/2 there (zero up to the stopping rule).
+    misfit : float
+        Weighted RMS of the final residual over that of the measurement.
+    status : str
+    """
+
+    theta: Array
+    x: Array
+    fields: Fields
+    model: Complex
+    cost: float
+    chi2: float
+    dof: int
+    normal: Array
+    shape_errors: Array
+    s: Complex
+    measured: Complex
+    variance: Array
+    system: System
+    rest: Array
+    misfit: float
+    status: str
+
+
+@final
+@dataclass(frozen=True)
+class System:
+    """Normal equations with the random effects projected out: ``normal`` (P, P), ``gradient`` (P,), ``chi2``, and whitened parts
+    per sensor (``B`` (S, m, 2L) shape errors, ``J`` (S, P, 2L), ``r`` (S, 2L), ``C`` (S, m, m), ``root`` (S, L))."""
+
+    normal: Array
+    gradient: Array
+    chi2: float
+    root: Array
+    B: Array
+    J: Array
+    C: Array
+    r: Array
+
+    @property
+    def effects(self) -> Array:
+        """(S, m): best shape errors."""
+        return np.asarray(np.linalg.solve(self.C, np.einsum("smk,sk->sm", self.B, self.r)[..., None])[..., 0])
+
+    def gains(self, columns: Complex, full: Array, rest: Array) -> tuple[Array, Array]:
+        """What one more column would explain, everything else projected out.
+
+        Parameters
+        ----------
+        columns : (C, L, S) complex, change of the transfer function per unit of the parameter.
+        full : (P, P) normal matrix with priors. rest : (P,) gradient of −cost/2 that is left (zero at the exact optimum).
+
+        Returns
+        -------
+        gain (C,) decrease of cost, value (C,) of the coefficient
+        """
+        c = np.moveaxis(stack(columns, self.root), 1, 0)                            # (S, C, 2L)
+        Bc = self.B @ np.swapaxes(c, 1, 2)                                         # (S, m, C)
+        CBc = np.linalg.solve(self.C, Bc)
+        BJ = self.B @ np.swapaxes(self.J, 1, 2)
+        cross = np.einsum("spk,sck->pc", self.J, c, optimize=True) - np.einsum("smp,smc->pc", BJ, CBc, optimize=True)
+        own = np.einsum("sck,sck->c", c, c) - np.einsum("smc,smc->c", Bc, CBc)
+        Br = np.einsum("smk,sk->sm", self.B, self.r)
+        slope = np.einsum("sck,sk->c", c, self.r) - np.einsum("smc,sm->c", CBc, Br)
+        solved = np.linalg.solve(full, cross)
+        information = np.maximum(own - (cross * solved).sum(0), 1e-12 * own + 1e-300)
+        slope = slope - rest @ solved
+        return np.asarray(slope ** 2 / information), np.asarray(slope / information)
+
+
+def stack(values: Complex, root: Array) -> Array:
+    """(..., L, S) complex → (..., S, 2L) real, divided by ``root`` (S, L)."""
+    moved = np.moveaxis(values, -1, -2) / root
+    return np.concatenate([moved.real, moved.imag], axis=-1)
+
+
+def predict(fam: Family, theta: Array, s: Complex, extension: Extension | None, x: Array) -> tuple[Fields, Chain | None]:
+    """Fields and measuring chain at (theta, x)."""
+    attach, chain = ((), None) if extension is None else extension.parts(x, s)
+    return fields(fam, solve(fam, theta), s, attach), chain
+
+
+def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex, variance: Array,
+             extension: Extension | None = None, log: bool = False, derivatives: bool = True) -> System:
+    """Normal equations of one Gauss–Newton step in (theta, x), data part only."""
+    fld, chain = predict(fam, theta, s, extension, x)
+    H, B = fld.H, shape_columns(fam, fld, s)
+    J = jacobian(fam, theta, fld, s) if derivatives else np.zeros((0, *H.shape), dtype=complex)
+    if chain is not None:
+        H, B, J = chain.apply(H), chain.apply(B), chain.apply(J)
+    if extension is not None and derivatives:
+        extra = np.empty((len(x), *H.shape), dtype=complex)
+        for i in range(len(x)):
+            step = 1e-4
+            moved = x + step * (np.arange(len(x)) == i)
+            attach, other = extension.parts(moved, s)
+            there = fields(fam, fld.modes, s, attach).H if attach else fld.H
+            extra[i] = ((other.apply(there) if other is not None else there) - H) / step
+        J = np.concatenate([J, extra])
+    residual = measured - H
+    if log:
+        residual, J, B = np.log(measured / H), J / H, B / H
+    root = np.sqrt(variance.T / 2)
+    Jr, Br, r = np.moveaxis(stack(J, root), 1, 0), np.moveaxis(stack(B, root), 1, 0), stack(residual, root)
+    C = Br @ np.swapaxes(Br, 1, 2) + np.eye(Br.shape[1]) / fam.shape_sd ** 2
+    Brr = np.einsum("smk,sk->sm", Br, r)
+    effect = np.linalg.solve(C, Brr[..., None])[..., 0]
+    chi2 = float((r ** 2).sum() - (Brr * effect).sum())
+    if not derivatives:
+        return System(np.zeros((0, 0)), np.zeros(0), chi2, root, Br, Jr, C, r)
+    BJ = Br @ np.swapaxes(Jr, 1, 2)
+    CBJ = np.linalg.solve(C, BJ)
+    flat = np.swapaxes(Jr, 0, 1).reshape(Jr.shape[1], -1)
+    normal = flat @ flat.T - np.einsum("smp,smq->pq", BJ, CBJ, optimize=True)
+    gradient = np.einsum("spk,sk->p", Jr, r) - np.einsum("smp,sm->p", CBJ, Brr)
+    return System(normal, gradient, chi2, root, Br, Jr, C, r)
+
+
+def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, steps: int, *, prior_sd: Array | None = None,
+            extension: Extension | None = None, x: Array | None = None, log: bool = False, tol: float = 1e-3
+            ) -> tuple[Array, Array, float]:
+    """Levenberg–Marquardt on cost = chi² + priors; returns the best theta, x and cost."""
+    count = fam.size
+    x = (np.zeros(0) if extension is None else extension.x) if x is None else x
+    prior = 1 / (fam.prior_sd if prior_sd is None else prior_sd) ** 2
+    centre = np.zeros(count)
+    if extension is not None:
+        prior = np.concatenate([prior, 1 / extension.prior_sd ** 2])
+        centre = np.concatenate([centre, extension.centre])
+    y = np.concatenate([theta, x])
+    system = assemble(fam, theta, x, s, measured, variance, extension, log)
+    cost = system.chi2 + float(prior @ (y - centre) ** 2)
+    damping = 1e-3
+    for _ in range(steps):
+        normal, gradient = system.normal + np.diag(prior), system.gradient - prior * (y - centre)
+        accepted = False
+        for _ in range(6):
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            trial = y + np.clip(step, -1.5, 1.5)
+            new = assemble(fam, trial[:count], trial[count:], s, measured, variance, extension, log, derivatives=False).chi2
+            new += float(prior @ (trial - centre) ** 2)
+            if np.isfinite(new) and new < cost:
+                accepted = True
+                break
+            damping = max(damping * 8, 1e-4)
+        if not accepted:
+            break
+        gain, y, damping = cost - new, trial, max(damping / 6, 1e-9)
+        cost = new
+        if gain < tol * max(1.0, 1e-3 * cost):
+            break
+        system = assemble(fam, y[:count], y[count:], s, measured, variance, extension, log)
+    return y[:count], y[count:], cost
+
+
+def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, extension: Extension | None = None,
+           x: Array | None = None, prior_sd: Array | None = None, status: str = "ok") -> LinearFit:
+    """Curvature, random effects and best prediction at ``theta``, ``x``."""
+    x = np.zeros(0) if x is None else x
+    system = assemble(fam, theta, x, s, measured, variance, extension)
+    fld, chain = predict(fam, theta, s, extension, x)
+    prior = 1 / (fam.prior_sd if prior_sd is None else prior_sd) ** 2
+    cost = system.chi2 + float(prior @ theta ** 2) + (extension.penalty(x) if extension is not None else 0.0)
+    errors = system.effects
+    model = fld.H + np.einsum("mls,sm->ls", shape_columns(fam, fld, s), errors)
+    model = model if chain is None else chain.apply(model)
+    misfit = float(np.sqrt((np.abs(measured - model) ** 2 / variance).sum() / (np.abs(measured) ** 2 / variance).sum()))
+    rest = system.gradient - np.concatenate([prior * theta, (x - extension.centre) / extension.prior_sd ** 2] if extension is not None
+                                            else [prior * theta])
+    full = system.normal + np.diag(np.concatenate([prior, 1 / extension.prior_sd ** 2]) if extension is not None else prior)
+    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, s, measured, variance, system, rest, misfit, status)
+
+
+def calibrate(fam: Family, s: Complex, measured: Complex, variance: Array, *, restarts: int = 6, enough: float = 1.1) -> LinearFit:
+    """Fit the family to a measured accelerance, globally.
+
+    Parameters
+    ----------
+    s : (L,) Laplace variable; ``measured`` (L, S) m/s²/N; ``variance`` (L, S) of it (noise and distortion; the floor of the model,
+        0.07 %, is added here).
+    restarts : starts with other stiffnesses tried while the cost per value stays above ``enough``.
+    """
+    variance = floored(measured, variance)
+    guess = modal_start(fam, s, measured, variance)
+    starts = [np.zeros(fam.size) if guess is None else guess, *_group_starts(fam)]
+    best, cost = starts[0], np.inf
+    for first in starts[:1 + restarts]:
+        theta, value = _anneal(fam, first, s, measured, variance)
+        if value < cost:
+            best, cost = theta, value
+        if cost < enough * 2 * measured.size:
+            break
+    status = "ok" if cost < 2 * 2 * measured.size else "misfit remains"
+    return finish(fam, best, s, measured, variance, status=status)
+
+
+def _group_starts(fam: Family) -> list[Array]:
+    """Starts with all joints of one kind softer or stiffer: modes that cross when a whole group moves make the basins."""
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(fam.names[:len(fam.K_parts)]):
+        groups.setdefault(name.rsplit("_", 1)[-1] if "_" in name else name, []).append(i)
+    out = []
+    for members in sorted(groups.values(), key=len, reverse=True)[:3]:
+        for sign in (-1.3, 1.3):
+            theta = np.zeros(fam.size)
+            theta[members] = sign * fam.scale_sd[members]
+            out.append(theta)
+    return out
+
+
+def floored(measured: Complex, variance: Array) -> Array:
+    """Variance with the floor of any model of this kind added."""
+    return np.asarray(variance + (RELATIVE_FLOOR * np.abs(measured)) ** 2)
+
+
+def _anneal(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
+    """Coarse to fine: log residual with 30 % tolerance, then relative tolerances of 10 and 2 %, then noise."""
+    relative = variance / np.maximum(np.abs(measured) ** 2, 1e-300)
+    thin = slice(None, None, 2)
+    wide = fam.prior_sd.copy()
+    wide[len(fam.names):len(fam.names) + fam.modes] = 0.01
+    theta, _, _ = descend(fam, theta, s[thin], measured[thin], relative[thin] + 0.3 ** 2, 12, prior_sd=wide, log=True, tol=1e-2)
+    for tolerance in (0.1, 0.02):
+        inflated = variance + (tolerance * np.abs(measured)) ** 2
+        theta, _, _ = descend(fam, theta, s[thin], measured[thin], inflated[thin], 8, tol=1e-2)
+    theta, _, cost = descend(fam, theta, s, measured, variance, 25)
+    return theta, cost
+
+
+# ---- poles -------------------------------------------------------------------------------------------------------------------
+
+
+def modal_start(fam: Family, s: Complex, measured: Complex, variance: Array) -> Array | None:
+    """Physical parameters from the poles of the measurement, paired with the nominal modes by MAC; None if no pole was found."""
+    nominal = solve(fam, np.zeros(fam.size))
+    inside = (nominal.omega < np.abs(s).max() * 1.02) & (nominal.omega > np.abs(s).min() * 0.6)
+    index = np.flatnonzero(inside)
+    if len(index) == 0:
+        return None
+    first = nominal.omega[index] * (-nominal.zeta[index] + 1j)
+    poles, residues = vector_fit(s, measured / s[:, None] ** 2, variance / np.abs(s[:, None]) ** 4, first)
+    pairs = pair(fam, poles, residues, nominal.omega[index], nominal.basis[:, index])
+    if len(pairs) < max(2, len(index) // 3):
+        return None
+    theta = np.zeros(fam.size)
+    count = len(fam.names)
+    for _ in range(15):
+        modes = solve(fam, theta)
+        rows, errors = [], []
+        for mode, pole in pairs:
+            target = _follow(modes.basis, fam, nominal.basis[:, index[mode]], modes.omega)
+            phi = modes.basis[:, target]
+            scale = np.exp(theta[:count])
+            k = np.einsum("pij,i,j->p", fam.K_parts, phi, phi)
+            m = np.einsum("pij,i,j->p", fam.M_parts, phi, phi)
+            rows.append(0.5 * scale * np.concatenate([k / modes.omega[target] ** 2, -m]))
+            errors.append(np.log(np.abs(pole) / modes.omega[target]))
+        A, e = np.array(rows), np.array(errors)
+        weight = 1 / np.maximum(0.004, 0.1 * np.abs(e)) ** 2
+        normal = (A.T * weight) @ A + np.diag(1 / fam.scale_sd ** 2)
+        step = np.linalg.solve(normal, (A.T * weight) @ e - theta[:count] / fam.scale_sd ** 2)
+        theta[:count] += np.clip(step, -0.7, 0.7)
+        if np.abs(step).max() < 1e-3:
+            break
+    for mode, pole in pairs:
+        if index[mode] < fam.modes:
+            zeta = max(-pole.real / np.abs(pole), 1e-4)
+            theta[count + fam.modes + index[mode]] = np.clip(np.log(zeta / fam.damping), -0.6, 0.6)
+    return theta
+
+
+def _follow(basis: Array, fam: Family, shape: Array, omega: Array) -> int:
+    """The current mode that is most like a nominal one (over all Ritz coordinates; the basis is nearly orthonormal in mass)."""
+    M = fam.M_parts.sum(0) + fam.M_rest
+    return int(np.argmax(np.abs(basis.T @ (M @ shape))))
+
+
+def vector_fit(s: Complex, H: Complex, variance: Array, poles: Complex, rounds: int = 12) -> tuple[Complex, Complex]:
+    """Common poles and residues of receptances (Gustavsen and Semlyen 1999, relaxed real form by conjugate pairs).
+
+    Returns
+    -------
+    poles (n,) with positive imaginary part, residues (n, S)
+    """
+    weight = 1 / np.sqrt(variance + (0.02 * np.abs(H)) ** 2)
+    L, S = H.shape
+    for _ in range(rounds):
+        basis = _partial_fractions(s, poles)
+        n = basis.shape[1]
+        own = np.concatenate([basis, np.ones((L, 1)), 1 / s[:, None] ** 2], axis=1)
+        blocks, rights = [], []
+        for i in range(S):
+            w = weight[:, i, None]
+            A = np.concatenate([own * w, -basis * (H[:, i, None] * w)], axis=1)
+            b = H[:, i] * weight[:, i]
+            A, b = np.concatenate([A.real, A.imag]), np.concatenate([b.real, b.imag])
+            scale = np.linalg.norm(A, axis=0) + 1e-300
+            q, r = np.linalg.qr(A / scale)
+            keep = own.shape[1]
+            blocks.append(r[keep:, keep:] / (1 / scale[keep:]))
+            rights.append((q.T @ b)[keep:])
+        A, b = np.concatenate(blocks), np.concatenate(rights)
+        norm = np.linalg.norm(A, axis=0) + 1e-300
+        c = np.linalg.lstsq(A / norm, b, rcond=None)[0] / norm
+        companion = np.zeros((n, n))
+        drive = np.zeros(n)
+        for k, p in enumerate(poles):
+            companion[2 * k:2 * k + 2, 2 * k:2 * k + 2] = [[p.real, p.imag], [-p.imag, p.real]]
+            drive[2 * k] = 2
+        roots = np.linalg.eigvals(companion - np.outer(drive, c))
+        roots = roots[roots.imag > 1e-3 * np.abs(roots)]
+        roots = -np.abs(roots.real) + 1j * roots.imag
+        if len(roots) == 0:
+            break
+        moved = len(roots) == len(poles) and np.allclose(np.sort_complex(roots), np.sort_complex(poles), rtol=1e-6)
+        poles = roots
+        if moved:
+            break
+    basis = _partial_fractions(s, poles)
+    own = np.concatenate([basis, np.ones((L, 1)), 1 / s[:, None] ** 2], axis=1)
+    residues = np.empty((len(poles), S), dtype=complex)
+    for i in range(S):
+        w = weight[:, i]
+        A, b = own * w[:, None], H[:, i] * w
+        A, b = np.concatenate([A.real, A.imag]), np.concatenate([b.real, b.imag])
+        scale = np.linalg.norm(A, axis=0) + 1e-300
+        x = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
+        residues[:, i] = x[:2 * len(poles):2] + 1j * x[1:2 * len(poles):2]
+    return poles, residues
+
+
+def _partial_fractions(s: Complex, poles: Complex) -> Complex:
+    """(L, 2n): for every pair 1/(s−p) + 1/(s−p*) and i/(s−p) − i/(s−p*)."""
+    a, b = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
+    out = np.empty((len(s), 2 * len(poles)), dtype=complex)
+    out[:, 0::2], out[:, 1::2] = a + b, 1j * a - 1j * b
+    return out
+
+
+def pair(fam: Family, poles: Complex, residues: Complex, omega: Array, basis: Array) -> list[tuple[int, complex]]:
+    """Nominal mode (index into ``omega``) and pole of every pair that agrees in shape (MAC) and lies within 25 % in frequency."""
+    shapes = (fam.sensors @ basis) * (fam.shaker @ basis)
+    candidates = []
+    for k, p in enumerate(poles):
+        zeta = -p.real / np.abs(p)
+        if zeta > 0.2:
+            continue
+        # residue of a mode is φ_s φ_f / (2 i ω): its imaginary part carries the shape
+        measured = residues[k].imag
+        for i in range(len(omega)):
+            detune = np.log(np.abs(p) / omega[i])
+            mac = (measured @ shapes[:, i]) ** 2 / max((measured @ measured) * (shapes[:, i] @ shapes[:, i]), 1e-300)
+            if np.abs(detune) < 0.25 and mac > 0.5:
+                candidates.append((mac - 2.0 * np.abs(detune), i, k))
+    out, seen_i, seen_k = [], set(), set()
+    for _, i, k in sorted(candidates, reverse=True):
+        if i not in seen_i and k not in seen_k:
+            out.append((i, complex(poles[k])))
+            seen_i.add(i)
+            seen_k.add(k)
+    return out
