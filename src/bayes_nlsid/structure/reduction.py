@@ -133,6 +133,8 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
     T_s, S = _statics(structure.K, A, constraint)
     rigid = full.rigid.shape[1] - (0 if constraint is None else constraint.shape[0])
     count = min(len(full.omega), len(names) - rigid)
+    if count < 1:
+        raise ValueError(f"{len(names)} masters only follow the {rigid} rigid-body modes; add masters to follow elastic ones")
     target = Modes(full.rigid, full.omega[:count], full.shapes[:, :count])
     T, M_r, K_r = T_s, _project(structure.M, T_s), _project(structure.K, T_s)
     history = [_compare(structure, target, T, (M_r, K_r), rigid)]
