@@ -10,7 +10,8 @@ import time
 from functools import partial
 from pathlib import Path
 
-from .truth.case import Order, make, plan, write
+from .truth.case import Order, make, plan
+from .truth.folder import write
 
 
 def _one(order: Order, seed: int, out: Path, answers: Path) -> tuple[str, float]:

@@ -16,13 +16,15 @@ FUDGE_SD = 0.003
 
 @dataclass(frozen=True)
 class Retuned:
-    """Accelerance by modes: ``frequency`` (m,) rad/s, ``ratio`` (m,), ``left`` (s, m), ``right`` (m,); ``misfit`` over noise."""
+    """Accelerance by modes: ``frequency`` (m,) rad/s, ``ratio`` (m,), ``left`` (s, m), ``right`` (m,); ``misfit`` over noise;
+    ``cost``: chi-square of the fit with its prior terms."""
 
     omega: np.ndarray
     ratio: np.ndarray
     left: np.ndarray
     right: np.ndarray
     misfit: float
+    cost: float = float("nan")
 
     def accelerance(self, s: np.ndarray) -> np.ndarray:
         """(f, sensors) at complex frequencies ``s`` (f,) rad/s."""
@@ -110,7 +112,7 @@ def retune(
         x, model, shapes, factor, r, cost, damp = new, trial, shapes_new, factor_new, r_new, cost_new, max(damp / 6, 1e-7)
         if gain < 1e-4 * cost:
             break
-    return Retuned(model.omega, model.ratio, model.left, model.right, float(np.sqrt(np.mean(np.abs(r) ** 2))))
+    return Retuned(model.omega, model.ratio, model.left, model.right, float(np.sqrt(np.mean(np.abs(r) ** 2))), cost)
 
 
 def _jacobian(

@@ -241,7 +241,7 @@ def naming(cases: Sequence[Scored]) -> dict[str, Any]:
 
 
 def placing(cases: Sequence[Scored]) -> dict[str, Any]:
-    """Place of detected singles: exact, in the set the tool states, in the set the truth's transfer functions give, among the first three."""
+    """Place of detected singles: exact, in the set the tool states, in the set the truth gives, among the first three."""
     at = threshold(cases)
     found = [c for c in cases if c.single and c.p > at and c.places[0] != "-"]
 

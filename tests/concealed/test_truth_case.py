@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from studies.concealed.generate import generate
 from studies.concealed.truth.campaign import FS, PERIODS
-from studies.concealed.truth.case import Order, _reach, make, plan, write
+from studies.concealed.truth.case import Order, make, plan
+from studies.concealed.truth.folder import write
+from studies.concealed.truth.sheet import answer
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +85,10 @@ def test_tuned_local_effect_reaches_its_target_in_the_recorded_response():
     a, b = made.clean["high_1"][1], made.baseline["high_1"][1]
     assert np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)) == pytest.approx(made.effects[0].achieved, rel=0.25)
     assert made.effects[0].achieved == pytest.approx(0.1, rel=0.05)
-    assert not _reach(made)["inside_tolerances"]
+    sheet = answer(made, {})
+    assert not sheet["inside_tolerances"] and sheet["chi2_not_lti"] > 100
+    name = made.effects[0].loc
+    assert sheet["equivalent_locations"][name]["similarity"][name] == pytest.approx(1.0)
 
 
 def test_noise_is_what_the_answer_says_and_periods_differ_by_it_only(made):

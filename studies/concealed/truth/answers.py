@@ -9,7 +9,7 @@ from .effects import Bench
 from .modes import Plant
 
 ALIKE = 0.98
-PROVABLE = 12.0  # chi-square a true effect must leave beyond the tolerances before anyone could be asked to see it
+PROVABLE = 12.0  # chi-square below which nobody can be asked to see an effect
 
 
 def spectrum(wave: np.ndarray, entry: Entry) -> np.ndarray:
@@ -20,10 +20,13 @@ def spectrum(wave: np.ndarray, entry: Entry) -> np.ndarray:
     return np.fft.rfft(wave, axis=0)
 
 
-def change_not_lti(clean: dict[str, tuple[np.ndarray, np.ndarray]], campaign: Campaign) -> float:
-    """Share of the high-level response that the best free linear system over all open records leaves over (noise-free).
+def change_not_lti(
+    clean: dict[str, tuple[np.ndarray, np.ndarray]], campaign: Campaign, variance: dict[str, np.ndarray]
+) -> tuple[float, float]:
+    """What the best free linear system over all open records of one kind leaves over (noise-free).
 
-    Per line and channel one free frequency response is fitted to the open records of one kind; lines without force are left over whole.
+    Per line and channel one free frequency response is fitted; lines without force are left over whole.  Returned are the share of
+    the high-level response (rms) and the chi-square of all that is left, against ``variance[name]`` (k, s) of the records' lines.
     """
     kind = STEADY if any(e.kind == STEADY and not e.sealed for e in campaign.entries) else BURST
     entries = [e for e in campaign.entries if e.kind == kind and not e.sealed]
@@ -32,9 +35,10 @@ def change_not_lti(clean: dict[str, tuple[np.ndarray, np.ndarray]], campaign: Ca
     power = np.sum(np.abs(F) ** 2, axis=0)
     lit = power > 1e-6 * power.max()
     H = np.einsum("rk,rks->ks", F.conj(), Y) / np.where(lit, power, np.inf)[:, None]
-    left = Y - H[None] * F[:, :, None]
+    left = np.abs(Y - H[None] * F[:, :, None]) ** 2
     high = [i for i, e in enumerate(entries) if e.level == 1.0]
-    return float(np.sqrt(np.sum(np.abs(left[high]) ** 2) / np.sum(np.abs(Y[high]) ** 2)))
+    chi2 = sum(float(np.sum(left[i] / variance[e.name])) for i, e in enumerate(entries))
+    return float(np.sqrt(np.sum(left[high]) / np.sum(np.abs(Y[high]) ** 2))), chi2
 
 
 def signatures(plant: Plant, names: list[str], sensors: int, lines_hz: np.ndarray, sigma: np.ndarray) -> np.ndarray:
@@ -67,44 +71,3 @@ def equivalent_places(plant: Plant, truth: str, names: list[str], bench: Bench, 
         "same": [n for n, a in zip(names, alike, strict=True) if a >= ALIKE],
         "same_by_noise": [n for n, a in zip(names, alike, strict=True) if a >= ALIKE or (1 - a) * energy < 9.0],
     }
-
-
-def sensitivities(
-    w: np.ndarray, ratio: np.ndarray, modes: np.ndarray, parts: dict[str, tuple[np.ndarray, float, bool]], hz: np.ndarray, damping_sd: float
-) -> np.ndarray:
-    """Change of the accelerance (f, s, parameters) per standard deviation of every stated tolerance.
-
-    ``w`` (n,) rad/s, ``ratio`` (n,), ``modes`` (n, s + 1): undamped modes with their values at sensors and shaker;
-    ``parts[name] = (matrix (n, n) in these modes, sd, is mass)``.  Damping has one parameter per mode below the highest line.
-    """
-    iw = 2j * np.pi * hz
-    G = 1.0 / (w**2 + iw[:, None] ** 2 + 2 * ratio * w * iw[:, None])
-    left, right = modes[:, :-1].T, modes[:, -1]
-    columns = []
-    for matrix, sd, mass in parts.values():
-        inner = np.einsum("fn,nm,fm->fn", G, matrix, G * right, optimize=True)
-        if mass:
-            inner = inner * iw[:, None] ** 2
-        columns.append(-sd * (iw**2)[:, None] * (inner @ left.T))
-    for k in np.nonzero(w < 2 * np.pi * hz[-1] * 1.2)[0]:
-        change = -damping_sd * 2 * ratio[k] * w[k] * iw * G[:, k] ** 2 * right[k] * iw**2
-        columns.append(change[:, None] * left[:, k][None])
-    return np.array(columns).transpose(1, 2, 0)
-
-
-def beyond_tolerances(
-    changes: list[np.ndarray], forces: list[np.ndarray], picks: list[np.ndarray], J: np.ndarray, variances: list[np.ndarray]
-) -> tuple[float, float]:
-    """Chi-square of the change, and what is left of it after the tolerances have absorbed what they can.
-
-    ``changes`` per record (k, s), ``forces`` (k,), ``picks`` the lines (f,) where ``J`` (f, s, p) is known, ``variances`` (k, s) of a line.
-    """
-    p = J.shape[2]
-    A, b, total = np.eye(p), np.zeros(p), 0.0
-    for change, force, pick, variance in zip(changes, forces, picks, variances, strict=True):
-        total += float(np.sum(np.abs(change) ** 2 / variance))
-        design = (J * force[pick][:, None, None] / np.sqrt(variance[pick])[:, :, None]).reshape(-1, p)
-        target = (change[pick] / np.sqrt(variance[pick])).ravel()
-        A += (design.conj().T @ design).real
-        b += (design.conj().T @ target).real
-    return total, float(total - b @ np.linalg.solve(A, b))

@@ -115,6 +115,8 @@ def draw_scenery(rng: np.random.Generator, sensors: int, hide_joints: bool, loos
     """Nominal layout, and a truth whose parameters are drawn from the stated tolerances and whose beam theory and mesh differ."""
     nominal = draw_layout(rng, sensors, hide_joints)
     tolerance = LOOSE if loose else TIGHT
+    # How far the truth lies outside the nominal model's family: from hardly visible to a few parts in a thousand of the response.
+    mess = 10 ** rng.uniform(-1.2, 0.0)
     factors: dict[str, float] = {}
 
     def drawn(name: str, sd: float) -> float:
@@ -131,12 +133,12 @@ def draw_scenery(rng: np.random.Generator, sensors: int, hide_joints: bool, loos
             j,
             k_slip=j.k_slip * drawn(f"J{i}_slip", tolerance.joint_stiffness_log_sd),
             k_open=j.k_open * drawn(f"J{i}_open", tolerance.joint_stiffness_log_sd),
-            c_slip=j.k_slip * 2 * ratio * rng.uniform(0.03, 0.2) / (2 * np.pi * 300.0),
+            c_slip=j.k_slip * 2 * ratio * mess * rng.uniform(0.03, 0.2) / (2 * np.pi * 300.0),
         )
         for i, j in enumerate(nominal.joints, start=1)
     )
-    # Positions are known to a few hundredths of a millimetre (a drilled jig).
-    sensors_true = tuple(Point(p.beam, p.x + 6e-5 * rng.standard_normal()) for p in nominal.sensors)
+    # Positions are known to a few hundredths of a millimetre at worst (a drilled jig).
+    sensors_true = tuple(Point(p.beam, p.x + 6e-5 * mess * rng.standard_normal()) for p in nominal.sensors)
     truth = replace(
         nominal,
         beams=beams,
