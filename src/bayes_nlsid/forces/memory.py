@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.forces.laws import Value, where
 
-SLIDERS = 80  # finite sliders that stand for the distribution on (0, phi_max); one more carries the jump at phi_max
-GROWTH = 1.08  # each bin is this much wider than the one below: small motions need narrow bins near phi = 0
-SUBSTEPS = 4  # steps of a Bouc–Wen loop on each monotone piece
+SLIDERS = 160  # finite sliders that stand for the distribution on (0, phi_max); one more carries the jump at phi_max
+SUBSTEPS = 2  # steps of a Bouc–Wen loop on each monotone piece
 CEILING = 1e50  # N; only a loop whose parameters give it no bound gets there
 
 
@@ -71,13 +70,14 @@ def iwan_sliders(p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
     Notes
     -----
-    Bins are fixed fractions of phi_max, widening geometrically; each slider carries the exact stiffness and the exact slip force
-    of its bin, so force is a continuous function of the parameters. Against the closed forms the backbone is within 1e-3 of
-    f_s and the energy per cycle within 0.5 % for amplitudes above 0.02 phi_max.
+    Bins are fixed fractions of phi_max, (i/SLIDERS)²: small motions need narrow bins near zero. Each slider carries the exact
+    stiffness and the exact slip force of its bin, so the parameters enter continuously. With theta = 1 the curve of first
+    loading is within 2e-4 f_s of the closed form and the energy per cycle within 0.5 % for amplitudes above 0.02 phi_max. With
+    theta < 1 the force falls in steps, slider by slider, of up to (1 − theta) 0.03 f_s, and energies are within 1.5 % at 0.3 phi_max.
     """
     f_s, k_t = p[..., 0:1], p[..., 1:2]
     m, b = np.maximum(p[..., 2:3] + 1.0, 1e-9), np.maximum(p[..., 3:4], 0.0)
-    edges = (GROWTH ** np.arange(SLIDERS + 1) - 1.0) / (GROWTH ** SLIDERS - 1.0)
+    edges = (np.arange(SLIDERS + 1) / SLIDERS) ** 2
     low, high = edges[:-1], edges[1:]
     reach = f_s * (1.0 + b) / np.maximum(k_t * (b + m / (m + 1.0)), 1e-290)
     share = high ** m - low ** m
@@ -138,10 +138,11 @@ def bouc_wen_step(z: Value, move: Value, alpha: Value, beta: Value, gamma: Value
 
     Notes
     -----
-    SUBSTEPS exponential Rosenbrock steps (two stages, third order; Hochbruck and Ostermann, Acta Numerica 2010, section 2.4).
-    For nu = 1 they are exact at any step length, and for any nu they stay stable however fast the loop saturates. Where z passes
-    through zero the right-hand side has a kink; the length up to the crossing is then taken from a quadrature of dq/dz and the
-    step begins anew at z = 0, so that the order is kept. For nu = 2 and 64 pieces per cycle the error is below 1e-6 of the largest force.
+    SUBSTEPS exponential Rosenbrock steps (two stages, third order; Hochbruck and Ostermann, Acta Numerica 2010). For nu = 1 they
+    are exact at any step length, and for any nu they stay stable however fast the loop saturates. Where z passes through zero the
+    right-hand side has a kink; the length up to the crossing is then taken from a quadrature of dq/dz and the step begins anew at
+    z = 0, so that the order is kept. With 64 pieces per half-cycle of a well-rounded loop the largest error is 1e-6 (nu = 2) to
+    1e-5 (nu = 1.5) of the largest force; with 16 it is 5e-5 to 1e-4.
     """
     direction = where(move < 0.0, -1.0, 1.0)
     step = np.abs(move) / SUBSTEPS
@@ -174,10 +175,16 @@ def bouc_wen_step(z: Value, move: Value, alpha: Value, beta: Value, gamma: Value
         stage = np.minimum(np.maximum(begin + length * phi1 * f, -CEILING), CEILING)
         curvature = alpha - bend * np.abs(stage) ** power - f - jacobian * (stage - begin)
         end = stage + 2.0 * length * phi3 * curvature
-        # The exact solution is monotone and never passes its fixed point (alpha/bend)^(1/nu).
-        settles = (bend * alpha > 0.0) & (begin >= 0.0)
-        fixed = where(settles, where(settles, alpha / where(settles, bend, 1.0), 1.0) ** (1.0 / power), CEILING)
-        low, high = where(f < 0.0, where(settles, fixed, -CEILING), begin), where(f < 0.0, begin, fixed)
+        # f is concave in y ≥ 0, so the exact solution lies between that of the tangent (stage) and that of the chord from here to
+        # the fixed point (alpha/bend)^(1/nu); these bounds take over where the loop saturates within one step.
+        settles = (bend > 0.0) & (alpha > 0.0) & (begin >= 0.0)
+        fixed = where(settles, where(settles, alpha / where(settles, bend, 1.0), 1.0) ** (1.0 / power), 1.0)
+        gap = fixed - begin
+        rate = where(settles & (np.abs(gap) > 1e-14 * fixed), f / where(gap == 0.0, 1.0, gap), 0.0)
+        chord = fixed - gap * np.exp(-np.minimum(np.maximum(rate, 0.0) * length, 700.0))
+        low = where(settles, chord, where(f < 0.0, -CEILING, begin))
+        high = where(settles, np.maximum(np.minimum(stage, np.maximum(fixed, begin)), chord),
+                     where(f < 0.0, begin, where(begin < 0.0, 0.0, CEILING)))
         y = np.minimum(np.maximum(end, low), high)
     return direction * y
 
