@@ -165,12 +165,39 @@ def _basis(lines: Lines, x: NDArray[np.float64]) -> Complex:
 
 def _project(lines: Lines, x: NDArray[np.float64]) -> tuple[Complex, Complex, int]:
     """Residual (b, s), coefficients (p, s), degrees of freedom per channel."""
+    unit, _, coefficients = _solve(lines, x)
+    residual = lines.response - unit @ (unit.conj().T @ lines.response)
+    return residual, coefficients, max(1, unit.shape[0] - unit.shape[1] - len(x) // 2)
+
+
+def _solve(lines: Lines, x: NDArray[np.float64]) -> tuple[Complex, Complex, Complex]:
+    """Orthonormal basis (b, p) of the columns, the inverse (p, p) that leads back to them, coefficients (p, s)."""
     basis = _basis(lines, x)
     size = np.linalg.norm(basis, axis=0)
     size = np.where(size > 0, size, 1.0)
-    coefficients = np.linalg.lstsq(basis / size, lines.response, rcond=1e-12)[0]
-    residual = lines.response - (basis / size) @ coefficients
-    return residual, coefficients / size[:, None], max(1, basis.shape[0] - basis.shape[1] - len(x) // 2)
+    left, values, right = np.linalg.svd(basis / size, full_matrices=False)
+    inverse = np.where(values > 1e-12 * values[0], 1 / values, 0.0)
+    mixing = (right.conj().T * inverse) / size[:, None]
+    return left, mixing, mixing @ (left.conj().T @ lines.response)
+
+
+def _jacobian(lines: Lines, x: NDArray[np.float64]) -> Complex:
+    """Derivative (2m, b, s) of the projected residual, −P⊥ (dΦ/dx) Φ⁺ Y (Kaufman's form: exact up to second order of the residual)."""
+    left, _, coefficients = _solve(lines, x)
+    _, zeta, poles = _unpack(x)
+    jw, each, m = 1j * lines.omega, lines.per_mode(), len(poles)
+    slope = [poles, np.abs(poles) * zeta * (-1 - 1j * zeta / np.sqrt(1 - zeta**2))]  # d pole / d ln f, d ln zeta
+    out = np.empty((2 * m, *lines.response.shape), dtype=complex)
+    for k, pole in enumerate(poles):
+        columns = [f / (jw - pole) ** 2 for f in lines.force.T]
+        if lines.transient:
+            turn = np.exp((pole - jw) * lines.dt)
+            columns.append(lines.dt * turn / (1 - turn) ** 2)
+        moved = np.stack(columns, axis=1) @ coefficients[k * each:(k + 1) * each]
+        moved = moved - left @ (left.conj().T @ moved)
+        for i in range(2):
+            out[i * m + k] = -moved * slope[i][k]
+    return out
 
 
 def _search(lines: Lines, start: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -183,13 +210,21 @@ def _search(lines: Lines, start: NDArray[np.float64], weight: NDArray[np.float64
     scale = 1 / np.sqrt(np.sum(np.abs(lines.response * weight) ** 2))
 
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        left = _project(lines, x)[0] * weight * scale
-        return np.concatenate([left.real.ravel(), left.imag.ravel()])
+        return _stack(_project(lines, x)[0] * weight * scale)
+
+    def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([_stack(column * weight * scale) for column in _jacobian(lines, x)], axis=1)
 
     inside = np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9)
     steps = np.concatenate([np.exp(start[m:]), np.ones(m)])  # a line is as wide as its damping ratio
-    found = least_squares(residual, inside, bounds=bounds, x_scale=np.maximum(steps, 1e-5), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=100)
+    found = least_squares(residual, inside, jacobian, bounds=bounds, x_scale=np.maximum(steps, 1e-5), xtol=1e-10, ftol=1e-10, gtol=1e-14,
+                          max_nfev=60)
     return 2 * float(found.cost) / scale**2, found.x
+
+
+def _stack(values: Complex) -> NDArray[np.float64]:
+    """Real and imaginary parts in one vector."""
+    return np.concatenate([values.real.ravel(), values.imag.ravel()])
 
 
 def _summary(lines: Lines, x: NDArray[np.float64], weight: NDArray[np.float64], cost: float) -> PoleFit:
@@ -200,12 +235,7 @@ def _summary(lines: Lines, x: NDArray[np.float64], weight: NDArray[np.float64], 
     frequency, zeta, _ = _unpack(x)
     residual, coefficients, freedom = _project(lines, x)
     noise = np.sqrt(np.sum(np.abs(residual) ** 2, axis=0) / freedom)
-    columns = []
-    for i in range(2 * m):
-        step = np.zeros(2 * m)
-        step[i] = 1e-4 * zeta[i] if i < m else 1e-4
-        columns.append(((_project(lines, x + step)[0] - _project(lines, x - step)[0]) / (2 * step[i]) * weight).ravel())
-    jacobian = np.sqrt(2) * np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
+    jacobian = np.sqrt(2) * np.stack([_stack(column * weight) for column in _jacobian(lines, x)], axis=1)
     information = jacobian.T @ jacobian
     size = np.sqrt(np.diag(information))
     status = "ok"
@@ -213,9 +243,7 @@ def _summary(lines: Lines, x: NDArray[np.float64], weight: NDArray[np.float64], 
         sd = np.sqrt(np.diag(np.linalg.inv(information / np.outer(size, size)))) / size
     else:
         sd, status = np.full(2 * m, np.inf), "poles are not determined by the data"
-    basis = _basis(lines, x)
-    scale = np.linalg.norm(basis, axis=0)
-    spread = np.sqrt(np.abs(np.diag(np.linalg.pinv((basis / scale).conj().T @ (basis / scale))))) / scale
+    spread = np.linalg.norm(_solve(lines, x)[1], axis=1)  # root of the diagonal of (ΦᴴΦ)⁻¹
     each = lines.per_mode()
     inputs = lines.force.shape[1]
     strongest = -1

@@ -1,0 +1,242 @@
+"""Structures from matrices on disk: .npz archives and MatrixMarket pairs, with location rows from an archive, a table or TOML."""
+
+from __future__ import annotations
+
+import csv
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.structure.structure import Matrix, Structure
+
+ROLES = ("sensors", "inputs", "joints", "other")
+
+
+def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping: str | Path | None = None, *,
+                  locations: str | Path | None = None, joints: Sequence[str] | None = None, sensors: Sequence[str] | None = None,
+                  inputs: Sequence[str] | None = None) -> Structure:
+    """A structure from files.
+
+    Parameters
+    ----------
+    mass : path
+        An ``.npz`` archive, or the mass matrix in MatrixMarket format (``.mtx``), symmetric ones stored by one triangle or in full.
+
+        Archive: ``M``, ``K`` (N, N), optional ``C``; ``K_parts`` (P, N, N) with ``K_part_names`` (P,), ``M_parts`` likewise;
+        ``dof_names`` (N,); ``location_names`` (L,) with ``location_vectors`` (L, N); ``sensor_select`` (s, N), which become S1..Ss;
+        ``shaker_vector`` (N,), which becomes the input SHAKER; ``base_vector`` (N,), rigid motion with the base, whose row BASE is
+        M times it: with acceleration of the base it gives minus the force on the structure, kg.
+    stiffness, damping : path
+        MatrixMarket files that belong to a mass in that format.
+    locations : path, optional
+        ``.npz`` with ``location_names`` and ``location_vectors``; ``.csv`` with columns name, dof, coefficient and optionally role
+        (repeated names add up; dof is a name or a number from 1); ``.toml`` with tables ``[[location]]`` of name, dofs,
+        coefficients, role. Roles are sensors, inputs, joints, other.
+    joints, sensors, inputs : sequence of str, optional
+        Which locations have these roles; by default those the files say, and for joints every location called ``J<number>...``,
+        ``ROOT...`` or ``TIP...`` of an archive.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, a matrix has the wrong size, is not symmetric, not finite or not positive (semi-)definite, or a name
+        is unknown.
+    """
+    path = Path(mass)
+    if path.suffix == ".npz":
+        archive = _archive(path)
+        content = _from_archive(path, archive)
+    else:
+        content = _from_market(path, stiffness, damping)
+    if locations is not None:
+        _add_locations(Path(locations), content)
+    for role, names in (("joints", joints), ("sensors", sensors), ("inputs", inputs)):
+        if names is not None:
+            unknown = [n for n in names if n not in content.rows]
+            if unknown:
+                raise InputError(f"{path}: {role}", f"unknown locations {unknown}", f"use names among {sorted(content.rows)}")
+            content.roles[role] = list(names)
+    try:
+        return Structure(content.M, content.K, content.dofs, content.rows, sensors=tuple(content.roles["sensors"]),
+                         inputs=tuple(content.roles["inputs"]), joints=tuple(content.roles["joints"]), C=content.C,
+                         K_parts=content.K_parts, M_parts=content.M_parts, notes=(f"matrices read from {path.name}",))
+    except ValueError as error:
+        raise InputError(str(path), str(error), "export the matrices again, complete and in one set of SI units") from error
+
+
+@final
+class _Content:
+    """What has been read so far."""
+
+    def __init__(self, M: Matrix, K: Matrix, C: Matrix | None, dofs: tuple[str, ...]) -> None:
+        self.M, self.K, self.C, self.dofs = M, K, C, dofs
+        self.rows: dict[str, NDArray[np.float64]] = {}
+        self.roles: dict[str, list[str]] = {role: [] for role in ROLES}
+        self.K_parts: dict[str, Matrix] = {}
+        self.M_parts: dict[str, Matrix] = {}
+
+    def add(self, where: str, name: str, row: NDArray[np.float64], role: str) -> None:
+        """One location; a name may be given again only for another role with the same row."""
+        if role not in ROLES:
+            raise InputError(where, f"location {name!r} has unknown role {role!r}", f"use one of {', '.join(ROLES)}")
+        if row.shape != (len(self.dofs),):
+            raise InputError(where, f"location {name!r} has {row.shape} entries", f"give {len(self.dofs)}, one for each degree of freedom")
+        if name in self.rows and not np.array_equal(self.rows[name], row):
+            raise InputError(where, f"location {name!r} is given twice with different rows", "rename one of them")
+        self.rows[name] = row
+        if name not in self.roles[role]:
+            self.roles[role].append(name)
+
+
+def _archive(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), f"cannot be read as an .npz archive ({error})", "save plain arrays with numpy.savez") from error
+
+
+def _from_archive(path: Path, archive: dict[str, NDArray[Any]]) -> _Content:
+    missing = [name for name in ("M", "K") if name not in archive]
+    if missing:
+        raise InputError(str(path), f"{' and '.join(missing)} missing", "save the mass matrix as M and the stiffness matrix as K")
+    M, K = _square(path, "M", archive["M"]), _square(path, "K", archive["K"])
+    n = len(M)
+    C = _square(path, "C", archive["C"]) if "C" in archive else None
+    dofs = tuple(str(d) for d in archive.get("dof_names", [f"q{i + 1}" for i in range(n)]))
+    content = _Content(M, K, C, dofs)
+    content.K_parts, content.M_parts = _parts(path, archive, "K", n), _parts(path, archive, "M", n)
+    names, vectors = archive.get("location_names", np.zeros(0, str)), archive.get("location_vectors", np.zeros((0, n)))
+    if len(names) != len(vectors):
+        raise InputError(f"{path}: location_vectors", f"{len(vectors)} rows for {len(names)} location_names", "give one row per name")
+    for name, row in zip(names, vectors, strict=True):
+        joint = str(name).startswith(("ROOT", "TIP")) or (str(name)[:1] == "J" and str(name)[1:2].isdigit())
+        content.add(f"{path}: location_vectors", str(name), np.asarray(row, dtype=float), "joints" if joint else "other")
+    for i, row in enumerate(np.atleast_2d(archive["sensor_select"]) if "sensor_select" in archive else []):
+        content.add(f"{path}: sensor_select", f"S{i + 1}", np.asarray(row, dtype=float), "sensors")
+    if "shaker_vector" in archive:
+        content.add(f"{path}: shaker_vector", "SHAKER", np.asarray(archive["shaker_vector"], dtype=float), "inputs")
+    if "base_vector" in archive:
+        base = np.asarray(archive["base_vector"], dtype=float)
+        if base.shape != (n,):
+            raise InputError(f"{path}: base_vector", f"has shape {base.shape}", f"give {n} entries, one for each degree of freedom")
+        content.add(f"{path}: base_vector", "BASE", M @ base, "other")
+    return content
+
+
+def _square(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.float64]:
+    if values.ndim != 2 or values.shape[0] != values.shape[1] or values.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {name}", f"has shape {values.shape} and type {values.dtype}", "save a square matrix of real numbers")
+    return np.asarray(values, dtype=float)
+
+
+def _parts(path: Path, archive: dict[str, NDArray[Any]], letter: str, n: int) -> dict[str, Matrix]:
+    """Named parts, each checked against the whole: what they leave must not be negative in mass or stiffness of any direction."""
+    stack = archive.get(f"{letter}_parts", np.zeros((0, n, n)))
+    names = [str(name) for name in archive.get(f"{letter}_part_names", [])]
+    if stack.shape != (len(names), n, n):
+        raise InputError(f"{path}: {letter}_parts", f"has shape {stack.shape} for {len(names)} names", f"give (P, {n}, {n}) and P names")
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: {letter}_part_names", f"repeat: {names}", "name every part differently")
+    return {name: np.asarray(part, dtype=float) for name, part in zip(names, stack, strict=True)}
+
+
+def _from_market(mass: Path, stiffness: str | Path | None, damping: str | Path | None) -> _Content:
+    if stiffness is None:
+        raise InputError(str(mass), "a mass matrix alone is no structure", "name the stiffness matrix too, or an .npz archive with M and K")
+    M, K = _market(mass), _market(Path(stiffness))
+    C = None if damping is None else _market(Path(damping))
+    if M.shape != K.shape or M.shape[0] != M.shape[1]:
+        raise InputError(f"{mass}, {stiffness}", f"sizes {M.shape} and {K.shape} differ or are not square", "export both from one model")
+    return _Content(M, K, C, tuple(f"q{i + 1}" for i in range(M.shape[0])))
+
+
+def _market(path: Path) -> Matrix:
+    """One matrix; a triangle marked ``symmetric`` is completed, sparse ones stay sparse."""
+    from scipy.io import mmread
+    from scipy.sparse import csr_array, issparse
+
+    try:
+        matrix = mmread(path)
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(str(path), f"cannot be read as MatrixMarket ({error})", "check the header line and the number of entries") from error
+    return csr_array(matrix, dtype=float) if issparse(matrix) else np.asarray(matrix, dtype=float)
+
+
+def _add_locations(path: Path, content: _Content) -> None:
+    if path.suffix == ".npz":
+        archive = _archive(path)
+        if "location_names" not in archive or "location_vectors" not in archive:
+            raise InputError(str(path), "location_names or location_vectors missing", "save both")
+        names, vectors = archive["location_names"], archive["location_vectors"]
+        if len(names) != len(vectors):
+            raise InputError(f"{path}: location_vectors", f"{len(vectors)} rows for {len(names)} location_names", "give one row per name")
+        roles = archive.get("location_roles", np.array(["other"] * len(names)))
+        for name, row, role in zip(names, vectors, roles, strict=True):
+            content.add(str(path), str(name), np.asarray(row, dtype=float), str(role))
+        return
+    entries = _from_csv(path) if path.suffix == ".csv" else _from_toml(path)
+    summed: dict[tuple[str, str], NDArray[np.float64]] = {}
+    for where, name, role, dof, coefficient in entries:
+        row = summed.setdefault((name, role), np.zeros(len(content.dofs)))
+        row[_dof(where, dof, content.dofs)] += coefficient
+    for (name, role), row in summed.items():
+        content.add(str(path), name, row, role)
+
+
+def _from_csv(path: Path) -> list[tuple[str, str, str, str, float]]:
+    """(where, name, role, dof, coefficient) of each line."""
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "save the table as plain text") from error
+    out = []
+    for number, row in enumerate(rows, start=2):
+        where = f"{path}: line {number}"
+        if not row.get("name") or not row.get("dof") or not row.get("coefficient"):
+            raise InputError(where, "name, dof or coefficient missing", "head the columns name, dof, coefficient, role")
+        out.append((where, row["name"].strip(), (row.get("role") or "other").strip(), row["dof"].strip(), _number(where, row["coefficient"])))
+    return out
+
+
+def _from_toml(path: Path) -> list[tuple[str, str, str, str, float]]:
+    try:
+        with open(path, "rb") as file:
+            tables = tomllib.load(file).get("location", [])
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise InputError(str(path), f"cannot be read as TOML ({error})", "write [[location]] tables with name, dofs, coefficients") from error
+    out = []
+    for number, table in enumerate(tables, start=1):
+        where = f"{path}: location {number}"
+        dofs, coefficients = table.get("dofs"), table.get("coefficients")
+        if not isinstance(table.get("name"), str) or not isinstance(dofs, list) or not isinstance(coefficients, list):
+            raise InputError(where, "name, dofs or coefficients missing", "give a name and two lists of the same length")
+        if len(dofs) != len(coefficients) or not dofs:
+            raise InputError(where, f"{len(dofs)} dofs but {len(coefficients)} coefficients", "give one coefficient for each dof")
+        out += [(where, table["name"], str(table.get("role", "other")), str(d), _number(where, c))
+                for d, c in zip(dofs, coefficients, strict=True)]
+    return out
+
+
+def _number(where: str, value: object) -> float:
+    try:
+        number = float(str(value))
+    except ValueError:
+        raise InputError(where, f"coefficient {value!r} is not a number", "write it like 1.0 or -0.5") from None
+    if not np.isfinite(number):
+        raise InputError(where, f"coefficient {value!r} is not finite", "write it like 1.0 or -0.5")
+    return number
+
+
+def _dof(where: str, name: str, dofs: tuple[str, ...]) -> int:
+    if name in dofs:
+        return dofs.index(name)
+    if name.isdigit() and 1 <= int(name) <= len(dofs):
+        return int(name) - 1
+    raise InputError(where, f"degree of freedom {name!r} does not exist", f"use a name of the archive or a number from 1 to {len(dofs)}")
