@@ -11,7 +11,6 @@ from bayes_nlsid.forces.term import Term
 from bayes_nlsid.study.building import user_terms
 from bayes_nlsid.study.quantities import quantity
 from bayes_nlsid.study.schema import (
-    PRIOR_KINDS,
     AlternativeEntry,
     ElementEntry,
     IdentificationEntry,
@@ -26,6 +25,8 @@ from bayes_nlsid.study.table import Table, nearest
 
 SCENARIOS = ("S1", "S2", "S3")
 RULES = ("coefficient", "stiffness", "force", "displacement", "velocity", "range")
+PRIOR_KEYS = {"normal": ("mean", "sd"), "lognormal": ("median", "log_sd"), "uniform": ("", ""), "loguniform": ("", ""),
+              "halfnormal": ("", "scale"), "logitnormal": ("mean", "sd")}
 GROUPS = ("table1", "memory", "all", "user")
 
 
@@ -182,23 +183,25 @@ def read_posterior(table: Table | None) -> PosteriorEntry | None:
     if table is None:
         return None
     priors = tuple(_read_prior(t) for t in table.tables("priors"))
-    entry = PosteriorEntry(table.text("likelihood", "whittle", ("whittle",)), table.integer("ensembles", 4, low=2),
+    entry = PosteriorEntry(table.text("likelihood", "whittle", ("whittle", "plain")), table.integer("ensembles", 4, low=2),
                            table.integer("steps", 2000, low=10), table.integer("walkers", None, low=4), priors)
     table.close()
     return entry
 
 
 def _read_prior(table: Table) -> PriorEntry:
-    kind = table.text("kind", choices=PRIOR_KINDS)
-    keys = {"normal": ("mean", "sd"), "lognormal": ("median", "log_sd")}.get(kind, ("lower", "upper"))
-    a, b = (table.number(k) for k in keys)
-    if kind.startswith("flat") and not a < b:
-        raise table.wrong("upper", f"{b:g} is not above lower {a:g}", "write lower < upper")
-    if not kind.startswith("flat") and not b > 0:
-        raise table.wrong(keys[1], f"{b:g} is not positive", "write a spread above zero")
+    kind = table.text("kind", choices=tuple(PRIOR_KEYS))
+    place, spread = PRIOR_KEYS[kind]
+    a = table.number(place) if place else 0.0
+    b = table.number(spread) if spread else 1.0
+    if not b > 0:
+        raise table.wrong(spread, f"{b:g} is not positive", "write a spread above zero")
     if kind == "lognormal" and not a > 0:
-        raise table.wrong("median", f"{a:g} is not positive", "write a median above zero")
-    entry = PriorEntry(table.text("parameter"), kind, a, b)
+        raise table.wrong(place, f"{a:g} is not positive", "write a median above zero")
+    lower, upper = table.number("lower", default=None), table.number("upper", default=None)
+    if lower is not None and upper is not None and not lower < upper:
+        raise table.wrong("upper", f"{upper:g} is not above lower {lower:g}", "write lower < upper")
+    entry = PriorEntry(table.text("parameter"), kind, a, b, lower, upper)
     table.close()
     return entry
 

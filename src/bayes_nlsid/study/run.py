@@ -100,10 +100,8 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
 
     result = summarise(study, done, seed)
     write_atomic(store.out / "result.json", to_text(result).encode())
-    if "posterior" in done:
-        from bayes_nlsid.study.stage_posterior import write_inference_data
-
-        write_inference_data(done["posterior"], store.out / "posterior.nc")
+    if "posterior" in done and "netcdf" in done["posterior"].arrays:
+        write_atomic(store.out / "posterior.nc", done["posterior"].arrays["netcdf"].tobytes())
     if "predict" in done and "amplitude" in done["predict"].arrays:
         _write_backbone(done["predict"], store.out / "backbone.npz")
     pictures = draw_all(study, done, told.update if told is not None else (lambda share, sentence: None))

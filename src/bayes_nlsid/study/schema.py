@@ -9,7 +9,6 @@ from typing import Any, Literal, final
 from bayes_nlsid.recordings.reading import RecordingSpec
 
 StructureKind = Literal["beam", "matrices", "oscillator"]
-PRIOR_KINDS = ("flat", "flat_symlog", "normal", "lognormal")
 STAGES = ("read", "linear", "identify", "posterior", "predict", "report")
 
 
@@ -129,14 +128,16 @@ class UserTermEntry:
 class PriorEntry:
     """``[[posterior.priors]]``: what is known of a parameter before the recording, in physical units.
 
-    ``parameter`` may hold ``*`` for any part of a name. ``a``, ``b``: lower and upper bound (flat kinds), mean and standard deviation
-    (normal), median and standard deviation of the logarithm (lognormal).
+    ``parameter`` may hold ``*`` for any part of a name. ``a`` and ``b`` are what ``Prior`` takes for ``kind``; ``lower`` and ``upper`` cut
+    it, by default at the bounds of the identification.
     """
 
     parameter: str
     kind: str
-    a: float
-    b: float
+    a: float = 0.0
+    b: float = 1.0
+    lower: float | None = None
+    upper: float | None = None
 
 
 @final

@@ -246,9 +246,9 @@ class Store:
         return Saved(stage, key, saved.arrays, saved.data, seconds, saved.versions)
 
     def _swap(self, new: Path, target: Path) -> None:
-        """Put a finished folder in place of the old one; only a folder with our own stage.json is ever replaced."""
+        """Put a finished folder in place of the old one; a folder that holds anything but a stage's own files is never replaced."""
         if target.exists():
-            if not (target / "stage.json").exists() and any(target.iterdir()):
+            if {path.name for path in target.iterdir()} - {"stage.json", "data.json", "arrays.npz"}:
                 raise InputError(str(target), "holds files that this program did not make", "move them away and run again")
             old = new.with_name(f"{new.name}.old")
             os.replace(target, old)

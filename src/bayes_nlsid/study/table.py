@@ -68,7 +68,7 @@ class Table:
             return self._content[key]
         if default is _REQUIRED:
             close = difflib.get_close_matches(key, list(self._content), n=1, cutoff=0.75)
-            mend = f"{close[0]!r} is perhaps meant to be {key!r}" if close else f"add {key} = ... under {self.name or 'the title'}"
+            mend = f"{close[0]!r} is perhaps meant to be {key!r}" if close else f"add {key} = ... " + (f"under {self.name}" if self.name else "at the top")
             raise self.wrong(key, "is missing", mend)
         return default
 
