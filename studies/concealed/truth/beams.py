@@ -152,12 +152,15 @@ def _bending_mass(mass: float, rho_i: float, L: float, s: float) -> np.ndarray:
 def _nodes(layout: Layout, index: int, size: float) -> np.ndarray:
     """Node positions of one beam: every place that carries something is a node, the rest is divided evenly."""
     beam = layout.beams[index]
-    keys = {beam.x0, beam.x1}
-    keys |= {x for x, _ in beam.heights if beam.x0 < x < beam.x1}
-    keys |= {j.x for j in layout.joints if index in (j.lower, j.lower + 1)}
-    keys |= {p.x for p in (*layout.sensors, layout.shaker) if p.beam == index}
+    fixed = {beam.x0, beam.x1}
+    fixed |= {x for x, _ in beam.heights if beam.x0 < x < beam.x1}
+    fixed |= {j.x for j in layout.joints if index in (j.lower, j.lower + 1)}
+    keys = sorted(fixed)
+    for x in sorted(p.x for p in (*layout.sensors, layout.shaker) if p.beam == index):
+        # Elements of a hair's length would spoil the arithmetic: such a point uses the node that is there.
+        if min(abs(x - k) for k in keys) > 4e-4:
+            keys.append(x)
     ordered = np.array(sorted(keys))
-    ordered = ordered[np.r_[True, np.diff(ordered) > 1e-6]]
     pieces = [np.linspace(a, b, max(1, int(np.ceil((b - a) / size))) + 1)[:-1] for a, b in zip(ordered[:-1], ordered[1:], strict=True)]
     return np.concatenate([*pieces, ordered[-1:]])
 

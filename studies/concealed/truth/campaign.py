@@ -115,7 +115,10 @@ class Truth:
         if entry.kind == STEADY:
             accel = np.tile(steady(self.plant, force, FS, names, "SHAKER", FS, 2), (PERIODS, 1))
             if self.locals:
-                accel = accel + self.periodic_extra(force, entry.start_s, SETTLE, PERIODS)
+                extra = self.periodic_extra(force, entry.start_s, SETTLE, PERIODS)
+                if unsteadiness(extra, force.size) > 1e-3 * float(np.std(accel)) and all(x.course is None for x in self.locals):
+                    extra = self.periodic_extra(force, entry.start_s, 3 * SETTLE, PERIODS)
+                accel = accel + extra
             return accel, np.tile(force, PERIODS)
         accel = drive(self.plant, force[:, None], FS, names, ["SHAKER"], FS, 2)
         if self.locals:
@@ -142,6 +145,11 @@ class Truth:
         v = np.tile(steady(self.plant, force, FS, places, "SHAKER", rate, 1), (settle + keep, 1))
         reply = self._local(d, v, start - settle * PERIOD)
         return drive(self.plant, reply, rate, names, places, FS, 2)[settle * force.size :]
+
+
+def unsteadiness(accel: np.ndarray, period: int) -> float:
+    """Rms difference (m/s^2) between the last period of ``accel`` (n, s) and the one before."""
+    return float(np.sqrt(np.mean((accel[-period:] - accel[-2 * period : -period]) ** 2)))
 
 
 @dataclass(frozen=True)

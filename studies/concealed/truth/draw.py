@@ -45,6 +45,8 @@ def draw_layout(rng: np.random.Generator, sensors: int, hide_joints: bool) -> La
     E, rho = [(70e9, 2700.0), (205e9, 7850.0), (112e9, 4430.0)][int(rng.choice(3, p=[0.4, 0.45, 0.15]))]
     lengths = rng.uniform(0.24, 0.36, 3) if three else rng.uniform(0.34, 0.52, 2)
     laps = rng.uniform(0.07, 0.11, 2) if three else rng.uniform(0.12, 0.20, 1)
+    # All places lie on a millimetre grid, in the truth give or take a jig's error.
+    lengths, laps = np.round(lengths, 3), np.round(laps, 3)
     beams, x = [], 0.0
     stepped = int(rng.integers(len(lengths))) if rng.random() < 0.5 else -1
     for i, length in enumerate(lengths):
@@ -56,14 +58,14 @@ def draw_layout(rng: np.random.Generator, sensors: int, hide_joints: bool) -> La
             at = round(free[0] + (free[1] - free[0]) * rng.uniform(0.3, 0.7), 3)
             heights = ((x, height), (at, round(height * rng.uniform(0.75, 1.25), 4)))
         beams.append(Beam("ABC"[i], x, float(length), heights, E * (1 + 0.01 * rng.standard_normal()), rho))
-        x += length - (laps[i] if i < len(laps) else 0.0)
+        x = round(float(x + length - (laps[i] if i < len(laps) else 0.0)), 3)
     joints = []
     for i, lap in enumerate(laps):
         count = 2 if three else int(rng.integers(2, 5))
         start = beams[i].x1 - lap
         for fraction in (np.arange(count) + 0.5) / count:
             at = start + lap * (fraction + rng.uniform(-0.06, 0.06))
-            joints.append(Joint(float(at), i, 10 ** rng.uniform(6.1, 6.9), 10 ** rng.uniform(6.3, 7.1)))
+            joints.append(Joint(round(float(at), 3), i, 10 ** rng.uniform(6.1, 6.9), 10 ** rng.uniform(6.3, 7.1)))
     support = str(rng.choice(["clamped_free", "clamped_sprung", "hinged", "suspended"], p=[0.45, 0.25, 0.15, 0.15]))
     root_fix, root_rot, tip_w = {
         "clamped_free": (10 ** rng.uniform(8, 9), 10 ** rng.uniform(3.9, 4.7), 0.0),

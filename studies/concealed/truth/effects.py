@@ -10,12 +10,14 @@ import numpy as np
 
 from . import catalogue
 from .beams import Assembled
-from .campaign import FS, Campaign, Local, Truth
+from .campaign import FS, Campaign, Local, Truth, unsteadiness
 from .catalogue import Place
 from .channels import Tap, apply, multiplier
 from .modes import Plant, plant
 from .modulation import draw_modulation
 from .response import Law, steady
+
+Course = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _local(
         at = place(bench, str(name))
         formula = catalogue.draw_formula(cls, rng, at, rare, kind)
         course = draw_modulation(formula.name, rng, bench.late_start, bench.campaign.band) if formula.kind == 0 else None
-        found = _tuned(cls, kind, target, bench, formula, at, course)
+        found = _steady(cls, kind, target, bench, formula, at, course)
         if best is None or abs(np.log(found.achieved / target)) < abs(np.log(best.achieved / target)):
             best = found
         if abs(np.log(best.achieved / target)) < 0.25:
@@ -162,7 +164,21 @@ def _local(
     return best
 
 
-def _tuned(cls: str, kind: str, target: float, bench: Bench, formula: catalogue.Formula, at: Place, course) -> Effect:
+def _steady(cls: str, kind: str, target: float, bench: Bench, formula: catalogue.Formula, at: Place, course: Course | None) -> Effect:
+    """Tuned effect whose response still repeats with the force: strong laws that go subharmonic or chaotic are halved."""
+    aim = target
+    for _ in range(4):
+        found = _tuned(cls, kind, aim, bench, formula, at, course)
+        if course is not None:
+            break
+        extra = Truth(bench.plant, found.locals, (), bench.sensors, 0).periodic_extra(bench.force, 40.0, 3, 2)
+        if unsteadiness(extra, bench.force.size) < 2e-3 * bench.rms:
+            break
+        aim *= 0.5
+    return replace(found, target=target)
+
+
+def _tuned(cls: str, kind: str, target: float, bench: Bench, formula: catalogue.Formula, at: Place, course: Course | None) -> Effect:
     """Bisect the formula's knob (in its logarithm) until the change meets the target; the best reachable value is kept."""
 
     def effect(knob: float, achieved: float) -> Effect:
