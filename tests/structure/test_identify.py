@@ -131,8 +131,9 @@ def forced(model: ModalModel, seed: int, noise: float, period: bool, seconds: fl
         burst[:n] = rng.standard_normal(n)
         drive = np.where((f > 10) & (f < 250), np.fft.rfft(burst), 0)
     w = 2 * np.pi * f
-    u = [drive * model.rows(["F"])[0, k] / (model.omega[k] ** 2 - w**2 + 2j * model.zeta[k] * model.omega[k] * w) for k in range(model.modes)]
-    response = np.fft.irfft(-w**2 * (model.rows(NAMES) @ np.array(u)), n=total).T[:n]
+    w0, z = model.omega[:, None], model.zeta[:, None]
+    u = drive * model.rows(["F"]).T / (w0**2 - w**2 + 2j * z * w0 * w)
+    response = np.fft.irfft(-w**2 * (model.rows(NAMES) @ u), n=total).T[:n]
     force = np.fft.irfft(drive, n=total)[:n, None]
     if period:
         response, force = np.tile(response, (3, 1)), np.tile(force, (3, 1))

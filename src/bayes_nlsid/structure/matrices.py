@@ -164,7 +164,8 @@ def _market(path: Path) -> Matrix:
     try:
         matrix = mmread(path)
     except (OSError, ValueError, IndexError) as error:
-        raise InputError(str(path), f"cannot be read as MatrixMarket ({error})", "check the header line and the number of entries") from error
+        mend = "check the header line and the number of entries"
+        raise InputError(str(path), f"cannot be read as MatrixMarket ({error})", mend) from error
     return csr_array(matrix, dtype=float) if issparse(matrix) else np.asarray(matrix, dtype=float)
 
 
@@ -201,7 +202,8 @@ def _from_csv(path: Path) -> list[tuple[str, str, str, str, float]]:
         where = f"{path}: line {number}"
         if not row.get("name") or not row.get("dof") or not row.get("coefficient"):
             raise InputError(where, "name, dof or coefficient missing", "head the columns name, dof, coefficient, role")
-        out.append((where, row["name"].strip(), (row.get("role") or "other").strip(), row["dof"].strip(), _number(where, row["coefficient"])))
+        role = (row.get("role") or "other").strip()
+        out.append((where, row["name"].strip(), role, row["dof"].strip(), _number(where, row["coefficient"])))
     return out
 
 
@@ -210,7 +212,8 @@ def _from_toml(path: Path) -> list[tuple[str, str, str, str, float]]:
         with open(path, "rb") as file:
             tables = tomllib.load(file).get("location", [])
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise InputError(str(path), f"cannot be read as TOML ({error})", "write [[location]] tables with name, dofs, coefficients") from error
+        mend = "write [[location]] tables with name, dofs, coefficients"
+        raise InputError(str(path), f"cannot be read as TOML ({error})", mend) from error
     out = []
     for number, table in enumerate(tables, start=1):
         where = f"{path}: location {number}"

@@ -2,8 +2,8 @@
 
 Over N samples the transform of a decaying exponential r exp(s t) is r (1 − e^{sNΔt}) / (1 − e^{(s − iω)Δt}) at every line, with no
 window and no bias; modes and transients outside the band add something smooth, a low polynomial in ω. A measured force adds its
-transform times 1/(iω − s) and times a low polynomial. All of this is linear in everything but the poles, so the fit is a variable projection
-over two numbers per mode, and noise enters line by line, independent and, over a narrow band, white.
+transform times 1/(iω − s) and times a low polynomial. All of this is linear in everything but the poles, so the fit is a variable
+projection over two numbers per mode, and noise enters line by line, independent and, over a narrow band, white.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _solve(lines: Lines, x: NDArray[np.float64]) -> tuple[Complex, Complex, Comp
     left, values, right = np.linalg.svd(basis / size, full_matrices=False)
     inverse = np.where(values > 1e-12 * values[0], 1 / values, 0.0)
     mixing = (right.conj().T * inverse) / size[:, None]
-    return left, mixing, mixing @ (left.conj().T @ lines.response)
+    return np.asarray(left, complex), np.asarray(mixing, complex), mixing @ (left.conj().T @ lines.response)
 
 
 def _jacobian(lines: Lines, x: NDArray[np.float64]) -> Complex:

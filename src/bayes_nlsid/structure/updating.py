@@ -87,7 +87,8 @@ def update(structure: Structure, parameters: Sequence[str] | Mapping[str, Sequen
     ValueError
         If a part is unknown or named twice, or no measured mode has a partner.
     """
-    groups = {name: tuple(parts) for name, parts in parameters.items()} if isinstance(parameters, Mapping) else {n: (n,) for n in parameters}
+    grouped = parameters if isinstance(parameters, Mapping) else {name: (name,) for name in parameters}
+    groups = {name: tuple(parts) for name, parts in grouped.items()}
     _check(structure, groups)
     prior = np.array([prior_sd[n] if isinstance(prior_sd, Mapping) else prior_sd for n in groups], dtype=float)
     if (prior <= 0).any() or frequency_error < 0:
