@@ -37,7 +37,7 @@ def build_structure(entry: StructureEntry) -> Structure | ModalModel:
         return oscillator(**values)
     from bayes_nlsid.structure.matrices import read_matrices
 
-    return read_matrices(*(path for _, path in entry.files), **values)
+    return read_matrices(**dict(entry.files), **values)
 
 
 def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -> ModalModel:

@@ -108,11 +108,7 @@ def recording_overview(time: Array, signals: Array, labels: Sequence[str], units
         left, right = grid[c]
         factor, unit = prefixed(signals[:, c], units[c])
         draw_signal(left, time, factor * signals[:, c], color=BLUE)
-        for k, (name, start, stop) in enumerate(windows):
-            left.axvspan(start, stop, color=CYCLE[(k + 1) % len(CYCLE)], alpha=0.16, linewidth=0)
-            if c == 0:
-                left.annotate(name, (0.5 * (start + stop), 1.0), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7.5,
-                              color=CYCLE[(k + 1) % len(CYCLE)])
+        _draw_windows(left, windows, float(time[-1]), labelled=c == 0)
         left.set_ylabel(f"{labels[c]} ({unit})")
         frequency, density = spectrum(signals[:, c], dt)
         right.semilogy(frequency[1:], density[1:], color=BLUE, linewidth=0.9, label="recording")
@@ -124,12 +120,24 @@ def recording_overview(time: Array, signals: Array, labels: Sequence[str], units
             right.axvline(f, color=GREY, linewidth=0.8, linestyle=":", label="modes" if k == 0 else None)
         right.set_xlim(0, min(top, 0.5 / dt))
         right.set_ylabel(f"{units[c].replace('^2', '²')}/√Hz")
-    grid[0][1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.0, handlelength=1.4)
+    grid[0][1].legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=2, columnspacing=1.0, handlelength=1.4)
     grid[-1][0].set_xlabel("time (s)")
     grid[-1][1].set_xlabel("frequency (Hz)")
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return figure
+
+
+def _draw_windows(axes: Axes, windows: Sequence[tuple[str, float, float]], end: float, labelled: bool) -> None:
+    """Windows as shading and, above the first panel, as named bars one above the other, so that overlaps stay readable."""
+    for k, (name, start, stop) in enumerate(windows):
+        color = CYCLE[(k + 1) % len(CYCLE)]
+        if stop - start < 0.8 * end:
+            axes.axvspan(start, stop, color=color, alpha=0.14, linewidth=0)
+        if labelled:
+            level = 1.05 + 0.13 * k
+            axes.plot([start, min(stop, end)], [level, level], transform=axes.get_xaxis_transform(), color=color, linewidth=3, clip_on=False)
+            axes.text(start, level + 0.015, name, transform=axes.get_xaxis_transform(), color=color, fontsize=7.5, va="bottom", ha="left")
 
 
 def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac: Array, *, shapes: Mapping[str, Array] | None = None,

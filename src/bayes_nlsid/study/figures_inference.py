@@ -44,7 +44,8 @@ def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mappin
         left.plot(x[ok] + rng.uniform(-0.16, 0.16, ok.sum()), y[ok], ".", color=GREY, alpha=0.55, markersize=4, label="every candidate tried")
     for phase, marker, color in (("forward", "o", BLUE), ("backward", "s", RED)):
         chosen = [i + 1 for i, s in enumerate(steps) if s["phase"] == phase]
-        left.plot(chosen, [scores[i] for i in chosen], marker, color=color, label=f"kept, {phase}", markersize=6)
+        if chosen:
+            left.plot(chosen, [scores[i] for i in chosen], marker, color=color, label=f"kept, {phase}", markersize=6)
     left.plot(at, scores, "-", color=BLUE, linewidth=1.0)
     left.plot(0, linear, "D", color="black", markersize=5)
     if floor is not None and floor > 0:

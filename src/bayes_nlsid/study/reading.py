@@ -175,6 +175,14 @@ def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
     return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt)
 
 
+def _read_update(table: Table) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """``update = ["E"]``, or a table ``[linear.update]`` of groups that share one factor: ``joints = ["J1_slip", "J2_slip"]``."""
+    if not isinstance(table.raw("update", None), dict):
+        return tuple((name, (name,)) for name in table.texts("update", ()))
+    inner = table.table("update")
+    return () if inner is None else tuple((key, inner.texts(key)) for key in inner.keys())
+
+
 def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec]) -> LinearEntry:
     if table is None:
         return LinearEntry()
@@ -182,7 +190,7 @@ def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec]) -> Li
     recording = table.text("recording", None)
     if recording is not None and recording not in names:
         raise table.wrong("recording", f"there is no recording {recording!r}", nearest(recording, names))
-    update = table.texts("update", ())
+    update = _read_update(table)
     entry = LinearEntry(recording, table.span("window", "time", None), table.integers("modes", ()), update,
                         table.numbers("damping", "ratio", ()), table.flag("use_measured", True))
     if update and recording is None:

@@ -105,17 +105,16 @@ def _positions(table: Table, name: str) -> tuple[tuple[str, float], ...]:
 
 
 def _matrices(table: Table) -> StructureEntry:
-    """One npz in the form of a case's ``nominal.npz``, or MatrixMarket files for mass and stiffness."""
-    if table.has("file"):
-        return StructureEntry("matrices", (), (("file", table.path("file")),))
-    files: list[tuple[str, Path]] = [("mass", table.path("mass")), ("stiffness", table.path("stiffness"))]
-    if table.has("names"):
-        files.append(("names", table.path("names")))
-    values: dict[str, Any] = {key: table.texts(key, ()) for key in GROUPS}
-    rows = table.table("locations")
-    if rows is not None:
-        values["locations"] = tuple((key, rows.numbers(key)) for key in rows.keys())
-    return StructureEntry("matrices", tuple(values.items()), tuple(files))
+    """``mass`` names an npz archive of everything, or the MatrixMarket file that ``stiffness`` belongs to."""
+    files: list[tuple[str, Path]] = [("mass", table.path("mass"))]
+    archive = files[0][1].suffix == ".npz"
+    for key in ("stiffness", "damping", "locations"):
+        if table.has(key):
+            files.append((key, table.path(key)))
+    if not archive and len(files) == 1:
+        raise table.wrong("stiffness", "is missing", "name the stiffness matrix that belongs to the mass matrix, or give one npz archive as mass")
+    values = {key: table.texts(key, None) for key in GROUPS}
+    return StructureEntry("matrices", tuple((k, v) for k, v in values.items() if v is not None), tuple(files))
 
 
 def _oscillator(table: Table) -> StructureEntry:

@@ -44,13 +44,13 @@ class ReductionEntry:
 class LinearEntry:
     """``[linear]``: where modes are measured and which parts of the structure are updated to them.
 
-    ``modes`` are 1-based; ``damping`` overrides what is measured, mode by mode; ``fit`` says whether modes are identified at all.
+    ``modes`` are 1-based; ``update`` names parts of the structure, or groups of parts that share one factor; ``damping`` overrides what is measured, mode by mode; ``use_measured`` puts the measured frequencies into the model for identification.
     """
 
     recording: str | None = None
     window: tuple[float, float] | None = None
     modes: tuple[int, ...] = ()
-    update: tuple[str, ...] = ()
+    update: tuple[tuple[str, tuple[str, ...]], ...] = ()
     damping: tuple[float, ...] = ()
     use_measured: bool = True
 

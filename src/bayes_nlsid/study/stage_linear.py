@@ -33,7 +33,8 @@ def linear(context: Context) -> Result:
         model = _with_stated_damping(context, nominal)
         arrays, names = model_record(model)
         return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": [*model.notes, "no low-level recording was named"]}
-    from bayes_nlsid.structure.identify import identify_modes, polarity
+    from bayes_nlsid.structure.identify import identify_modes
+    from bayes_nlsid.structure.polarity import polarity
 
     context.progress(0.2, "identifying modes from low-level data")
     wanted = tuple(k - 1 for k in study.linear.modes) or tuple(range(nominal.modes))
@@ -42,20 +43,7 @@ def linear(context: Context) -> Result:
     signs = [{"channel": f.channel, "sentence": f.sentence} for f in polarity(measured, nominal)]
     for sign in signs:
         context.note(sign["sentence"])
-    updated: list[dict[str, Any]] = []
-    notes: list[str] = []
-    final = structure
-    if study.linear.update and isinstance(structure, Structure):
-        from bayes_nlsid.structure.updating import update
-
-        context.progress(0.6, "updating " + ", ".join(study.linear.update))
-        try:
-            found = update(structure, study.linear.update, measured)
-        except ValueError as error:
-            raise InputError(f"{study.file.name}: [linear] update", str(error), "name parts of the structure") from None
-        final = found.structure
-        updated = [{"part": name, "factor": float(value), "log_sd": float(sd)}
-                   for name, value, sd in zip(study.linear.update, np.atleast_1d(found.values), np.atleast_1d(found.sd), strict=True)]
+    final, updated, notes = _updated(context, structure, measured)
     context.progress(0.8, "reducing")
     computed = reduce_structure(final, study.reduction)
     model = _with_stated_damping(context, _measured_into(computed, measured, study.linear.use_measured))
@@ -68,6 +56,26 @@ def linear(context: Context) -> Result:
                     "notes": [*model.notes, *measured.notes, *notes], "recording": recording.name}
 
 
+def _updated(context: Context, structure: Structure | ModalModel, measured: Any) -> tuple[Any, list[dict[str, Any]], list[str]]:
+    """The structure with its named parts scaled to the measured modes, a row for each part, and what to beware of."""
+    groups = dict(context.study.linear.update)
+    if not groups:
+        return structure, [], []
+    where = f"{context.study.file.name}: [linear] update"
+    if not isinstance(structure, Structure):
+        raise InputError(where, "an oscillator has no parts to update", "remove update; its frequency and damping are measured directly")
+    from bayes_nlsid.structure.updating import update
+
+    context.progress(0.6, "updating " + ", ".join(groups))
+    try:
+        found = update(structure, groups, measured)
+    except ValueError as error:
+        raise InputError(where, str(error), "name parts of the structure") from None
+    rows = [{"part": name, "parts": list(groups[name]), "factor": float(value), "log_sd": float(sd), "identifiable": name not in found.unidentifiable}
+            for name, value, sd in zip(found.names, found.values, found.sd, strict=True)]
+    return found.structure, rows, [] if found.status == "ok" else [f"updating: {found.status}"]
+
+
 def _shape_lines(context: Context, updated: list[dict[str, Any]], modes: list[int]) -> Arrays:
     """Mode shapes along the beam for the picture: the same beam with 41 more points, scaled like the model."""
     entry = context.study.structure
@@ -77,7 +85,7 @@ def _shape_lines(context: Context, updated: list[dict[str, Any]], modes: list[in
     structure = build_structure(replace(entry, values=tuple({**values, "points": points}.items())))
     assert isinstance(structure, Structure)
     if updated:
-        structure = structure.scaled({row["part"]: row["factor"] for row in updated})
+        structure = structure.scaled({part: row["factor"] for row in updated for part in row["parts"]})
     fine = reduce_structure(structure, replace(context.study.reduction, method="none", masters=(), modes=max(modes) + 1))
     return {"line_position": x, "line": fine.rows([f"shape {i}" for i in range(len(x))])[:, modes]}
 
