@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, final
@@ -10,6 +9,7 @@ from typing import Protocol, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayes_nlsid.forces.march import compiled_wanted
 from bayes_nlsid.model import Model
 from bayes_nlsid.simulation.joints import Joints
 from bayes_nlsid.simulation.response import Response
@@ -19,6 +19,10 @@ from bayes_nlsid.simulation.stepping import NumpyStepper
 Array = NDArray[np.float64]
 QUANTITIES = ("displacement", "velocity", "acceleration")
 BLOCK_BYTES = 2**25
+LONG_RUN = 100_000
+"""Steps of numpy (each at the price of one small batch) beyond which the compiled loop is worth loading."""
+EVEN_BATCH = 50
+"""Samples at which a numpy step costs twice that of one sample."""
 
 
 class Stepper(Protocol):
@@ -42,7 +46,7 @@ class Stepper(Protocol):
 def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: ArrayLike | None = None, u0: ArrayLike | None = None,
              v0: ArrayLike | None = None, scheme: SchemeName = "hht", alpha: float = -0.05, keep: tuple[str, ...] = (), every: int = 1,
              store: tuple[str, ...] = QUANTITIES, stop_amplitude: float | None = None,
-             progress: Callable[[str], None] | None = None) -> Response:
+             compiled: bool | None = None, progress: Callable[[str], None] | None = None) -> Response:
     """Integrate the modal equations of motion with all elements, for all samples of theta at once.
 
     Parameters
@@ -70,8 +74,11 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
         Quantities to store.
     stop_amplitude : float or None
         Stop once the largest displacement (m) at ``keep[0]`` over at least one period of the first mode is below this in every sample.
+    compiled : bool or None
+        None: the compiled loop for long runs, numpy for short ones, for which compiling would take longer than running; True or False: as told. Both
+        give the same numbers up to rounding. Laws of a user's own and laws that jump run in numpy always.
     progress : callable or None
-        Told in a sentence when something takes longer than expected, e.g. the first compilation.
+        Told in a sentence before the first compilation.
 
     Returns
     -------
@@ -84,7 +91,7 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
 
     Notes
     -----
-    Compiled where every term of the model allows it, unless the environment variable ``BAYES_NLSID_COMPILED`` is ``0``.
+    The environment variable ``BAYES_NLSID_COMPILED=0`` switches compiled loops off.
     """
     request = _request(model, theta, fs, samples, force, u0, v0, keep, every, store)
     omega, zeta = model.linear_values(request.theta)
@@ -92,13 +99,14 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     coefficients = steps(omega[0], zeta[0], 1 / fs, scheme, alpha) if same else steps(omega, zeta, 1 / fs, scheme, alpha)
     first = coefficients if same else steps(omega[0], zeta[0], 1 / fs, scheme, alpha)
     period_error, false_damping = spectrum(first, omega[0], zeta[0])
-    stepper, compiled = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress)
+    wanted = compiled if compiled is not None else samples * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
+    stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None, wanted)
     window = int(np.ceil(fs / (omega.min() / (2 * np.pi)) / every)) * every
     stored, status = _drive(request, stepper, window, stop_amplitude)
     final = tuple(np.ascontiguousarray(a.T) for a in (stepper.displacement, stepper.velocity))
     return Response(every / fs, request.keep, *stored, status=status, iterations=stepper.iterations.copy(), unconverged=stepper.failures.copy(),
                     scheme=scheme, period_error=period_error, false_damping=false_damping, final_displacement=final[0],
-                    final_velocity=final[1], compiled=compiled)
+                    final_velocity=final[1], compiled=ran)
 
 
 @final
@@ -162,11 +170,23 @@ def _request(model: Model, theta: ArrayLike, fs: float, samples: int, force: Arr
     return _Request(model, values, samples, applied, start[0], start[1], names, model.linear.rows(names), every, tuple(store))
 
 
-def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, progress: Callable[[str], None] | None) -> tuple[Stepper, bool]:
+def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, progress: Callable[[str], None] | None,
+             wanted: bool) -> tuple[Stepper, bool]:
     joints = Joints(request.model, request.theta)
     first = request.modal_force(0, 1)
-    p = None if first is None else first[0]
-    return NumpyStepper(coefficients, joints, (2 * zeta * omega).T, (omega**2).T, request.u0, request.v0, p), False
+    start = ((2 * zeta * omega).T, (omega**2).T, request.u0, request.v0, None if first is None else first[0])
+    if wanted and compiled_wanted() and not joints.jumping:
+        from bayes_nlsid.forces.compiled import law_code
+        from bayes_nlsid.simulation.lanes import CompiledStepper
+
+        # sliders and Bouc-Wen loops have a walk of their own and need no law
+        codes = [law_code(entry.term) if entry.term.memory in ("none", "masing") else (0, 0.0) for entry in joints.entries]
+        known = [code for code in codes if code is not None]
+        if len(known) == len(codes):
+            if progress is not None:
+                progress("compiled time loop: the first run on a computer compiles it, which can take a minute")
+            return CompiledStepper(coefficients, joints, known, *start), True
+    return NumpyStepper(coefficients, joints, *start), False
 
 
 def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: float | None) -> tuple[list[Array], NDArray[np.str_]]:
@@ -209,8 +229,3 @@ def _decayed(displacement: Array | None, finite: NDArray[np.bool_], floor: float
     if len(displacement) < window:
         return False
     return bool((np.abs(displacement[-window:, 0, :][:, finite]).max(axis=0) < floor).all())
-
-
-def compiled_allowed() -> bool:
-    """Whether the environment lets compiled loops run."""
-    return os.environ.get("BAYES_NLSID_COMPILED", "1") != "0"

@@ -38,8 +38,8 @@ class StaticGroup:
 
 @final
 @dataclass(frozen=True)
-class MemoryPlace:
-    """One location of an element with memory; ``p`` (S, n_p)."""
+class Entry:
+    """One location of an element; ``p`` (S, n_p)."""
 
     term: Term
     row: int
@@ -87,17 +87,17 @@ class Joints:
         self.locations = tuple(names)
         self.shapes = model.linear.rows(self.locations) if names else np.zeros((0, model.linear.modes))
         self.static: list[StaticGroup] = []
-        self.memory: list[MemoryPlace] = []
+        self.entries: list[Entry] = []
         for i, element in enumerate(model.elements):
             values = np.stack([model.element_values(theta, i, name) for name in element.locations])  # (g, S, n_p)
             rows = np.array([names.index(name) for name in element.locations], dtype=np.intp)
+            self.entries += [Entry(element.term, int(r), values[g], element.excess) for g, r in enumerate(rows)]
             if element.term.memory == "none":
                 p = tuple(np.ascontiguousarray(values[..., j]) for j in range(values.shape[-1]))
                 stiffness = element.term.stiffness
                 spring = np.broadcast_to(stiffness(*p), p[0].shape).copy() if element.excess and stiffness is not None else None
                 self.static.append(StaticGroup(element.term, rows, p, spring, jumps_of(element.term, p)))
-            else:
-                self.memory += [MemoryPlace(element.term, int(r), values[g], element.excess) for g, r in enumerate(rows)]
+        self.memory = [entry for entry in self.entries if entry.term.memory != "none"]
         self.states: list[Any] = []
         # one memoryless element without jumps holds all rows in order: no gathering or scattering
         self._simple = len(self.static) == 1 and not self.memory and not self.static[0].jumps

@@ -144,8 +144,8 @@ class NumpyStepper:
             self.g = joints.begin(q, w, steps.step, give_q, give_v)
             if joints.jumping:
                 self.g = self.g + joints.breakaway(q, w, b @ (modal - damping * v - stiffness * u - b.T @ self.g))
-            self._row_q = float(np.abs(self.linear.flexibility(slice(None), 0)).sum(axis=-1).max())
-            self._row_v = float(np.abs(self.linear.flexibility(slice(None), 1)).sum(axis=-1).max())
+            # largest row sums: bounds of what a force changes, (S,) or (1,)
+            self._reach_q, self._reach_v = (np.abs(self.linear.flexibility(slice(None), i)).sum(axis=-1).max(axis=-1) for i in (0, 1))
         f = modal - b.T @ self.g
         self.linear.restart(u, v, f - damping * v - stiffness * u, f)
         self._past = [self.g, self.g]
@@ -211,16 +211,16 @@ class NumpyStepper:
         e = f - g
         eq = lin.give_q(e)
         new = f - fq * eq
-        contraction = float(np.abs(fq).max()) * self._row_q
+        contraction = np.abs(fq).max(axis=0) * self._reach_q
         np.maximum(self._scale_q, np.abs(q), out=self._scale_q)
         if v is None or fv is None:
-            doubt = np.abs(eq) > ACCEPT / max(contraction, SMALLEST_CONTRACTION) * self._scale_q
-            return new, (f, fq, fv, held), doubt.any(axis=0)
+            limit = ACCEPT / np.maximum(contraction, SMALLEST_CONTRACTION)
+            return new, (f, fq, fv, held), (np.abs(eq) > limit * self._scale_q).any(axis=0)
         ev = lin.give_v(e)
         new -= fv * ev
-        contraction += float(np.abs(fv).max()) * self._row_v
+        contraction += np.abs(fv).max(axis=0) * self._reach_v
         np.maximum(self._scale_v, np.abs(v), out=self._scale_v)
-        limit = ACCEPT / max(contraction, SMALLEST_CONTRACTION)
+        limit = ACCEPT / np.maximum(contraction, SMALLEST_CONTRACTION)
         doubt = (np.abs(eq) > limit * self._scale_q) | (np.abs(ev) > limit * self._scale_v)
         return new, (f, fq, fv, held), doubt.any(axis=0)
 
