@@ -91,18 +91,18 @@ def test_a_trial_leaves_no_trace(term: Term) -> None:
 @memories
 def test_tangent_is_the_derivative_of_the_trial_force(term: Term) -> None:
     """On steps without a turning point inside; away from the instant at which a slider breaks or a loop closes."""
-    q, v = ringing(200, 1 / 4000)
+    q, v = ringing(400, 1 / 20000)
     p = batch_of(term, 1)
     state, checked = start_state(term, p), 0
-    for i in range(200):
+    for i in range(400):
         if i and v[i - 1] * v[i] > 0:
             h = 1e-6 * abs(q[i] - q[i - 1])
-            low, here, high = (trial(term, state, q[i:i + 1] + k * h, v[i:i + 1], 1 / 4000, p) for k in (-1, 0, 1))
+            low, here, high = (trial(term, state, q[i:i + 1] + k * h, v[i:i + 1], 1 / 20000, p) for k in (-1, 0, 1))
             if np.isclose(low[1], high[1], rtol=1e-4)[0]:
                 checked += 1
-                assert (high[0] - low[0])[0] / (2 * h) == pytest.approx(here[1][0], rel=1e-3, abs=1e-3 * p[0].max())
-        state = commit(term, state, q[i:i + 1], v[i:i + 1], 1 / 4000, p)
-    assert checked > 120
+                assert (high[0] - low[0])[0] / (2 * h) == pytest.approx(here[1][0], rel=5e-3, abs=1e-3 * p[0].max())
+        state = commit(term, state, q[i:i + 1], v[i:i + 1], 1 / 20000, p)
+    assert checked > 300
 
 
 def test_five_thousand_open_loops_fit() -> None:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayes_nlsid.forces import memory
 from bayes_nlsid.forces.term import Term
 
-BLOCK = 1 << 17  # values evaluated at a time: a block and its temporaries stay in the cache
+BLOCK = 1 << 16  # values evaluated at a time: a block and its temporaries stay in the cache
 
 
 @final
@@ -45,19 +45,43 @@ class Path:
     parent: NDArray[np.intp]
 
     @cached_property
-    def links(self) -> tuple[NDArray[np.intp], NDArray[np.intp], tuple[NDArray[np.intp], ...]]:
-        """Reversal nodes (R,), the slot (N,) of each node's reversal among them (R: none), and the doubled links, each (R + 1,)."""
-        reversals = np.unique(self.parent[self.parent >= 0])
-        count = len(reversals)
-        slot = np.full(len(self.nodes), count, dtype=np.intp)
+    def reversals(self) -> NDArray[np.intp]:
+        """Nodes (R,) from which some branch starts, ascending."""
+        return np.unique(self.parent[self.parent >= 0])
+
+    @cached_property
+    def slot(self) -> NDArray[np.intp]:
+        """Place (N,) of each node's reversal among ``reversals``; R on the curve of first loading."""
+        slot = np.full(len(self.nodes), len(self.reversals), dtype=np.intp)
         bound = self.parent >= 0
-        slot[bound] = np.searchsorted(reversals, self.parent[bound])
-        link = np.append(slot[reversals], count)
-        passes = []
+        slot[bound] = np.searchsorted(self.reversals, self.parent[bound])
+        return slot
+
+    @cached_property
+    def passes(self) -> tuple[NDArray[np.intp], ...]:
+        """Doubled links, each (R + 1,): from each reversal to the one 1, 2, 4, … before it; R where there is none."""
+        count = len(self.reversals)
+        link = np.append(self.slot[self.reversals], count)
+        out = []
         while (link < count).any():
-            passes.append(link)
+            out.append(link)
             link = link[link]
-        return reversals, slot, tuple(passes)
+        return tuple(out)
+
+    @cached_property
+    def scale(self) -> NDArray[np.float64]:
+        """(N,) 1 on the curve of first loading, 2 on every later branch."""
+        return np.where(self.parent < 0, 1.0, 2.0)
+
+    @cached_property
+    def reach(self) -> NDArray[np.float64]:
+        """(N,) displacement at which the curve of first loading is to be read for each node, m."""
+        return (self.nodes - np.where(self.parent < 0, 0.0, self.nodes[self.parent])) / self.scale
+
+    @cached_property
+    def sample_slot(self) -> NDArray[np.intp]:
+        """``slot`` of each sample, (n,)."""
+        return self.slot[self.sample]
 
 
 @final
@@ -202,19 +226,12 @@ def _static(term: Term, motion: Motion, p: NDArray[np.float64]) -> NDArray[np.fl
 
 def _masing(term: Term, motion: Motion, p: NDArray[np.float64]) -> NDArray[np.float64]:
     path = motion.path
-    reversals, slot, passes = path.links
-    first_loading = slot == len(reversals)
-    origin = np.where(first_loading, 0.0, path.nodes[path.parent])
-    doubled = np.where(first_loading, 1.0, 2.0)
-    still = np.zeros(1)
-    rise = doubled * term.static_force((path.nodes - origin) / doubled, still, p)
-    if not len(reversals):
-        return rise[:, path.sample]
+    rise = path.scale * term.static_force(path.reach, np.zeros(1), p)
     # Force at every reversal: its own rise plus the force at the reversal before, and so on down the chain.
-    at_reversal = np.concatenate([rise[:, reversals], np.zeros((len(p), 1))], axis=1)
-    for link in passes:
+    at_reversal = np.concatenate([rise[:, path.reversals], np.zeros((len(p), 1))], axis=1)
+    for link in path.passes:
         at_reversal = at_reversal + at_reversal[:, link]
-    return rise[:, path.sample] + at_reversal[:, slot[path.sample]]
+    return rise[:, path.sample] + at_reversal[:, path.sample_slot]
 
 
 def _marched(term: Term, motion: Motion, p: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -126,12 +126,13 @@ def trial(term: Term, state: State, q: ArrayLike, v: ArrayLike, dt: float, p: Ar
             along, across = term.slope(here, speed, *values.T)
         else:
             after = _advance(term, state, here, speed, dt, values)
-            force, along, across = after.state.force.copy(), after.tangent, np.zeros(len(values))
+            force, along, across = after.state.force, after.tangent, np.zeros(len(values))
         if excess and term.stiffness is not None:
             spring = np.asarray(term.stiffness(*values.T))
             force, along = force - spring * here, along - spring
-    shape = (len(values),)
-    return np.broadcast_to(force, shape), np.broadcast_to(along, shape), np.broadcast_to(across, shape)
+    out = np.empty((3, len(values)))
+    out[0], out[1], out[2] = force, along, across
+    return out[0], out[1], out[2]
 
 
 def commit(term: Term, state: State, q: ArrayLike, v: ArrayLike, dt: float, p: ArrayLike) -> State:
