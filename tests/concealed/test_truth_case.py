@@ -1,11 +1,14 @@
 """Generated cases: format, no answers inside, same bytes from the same seed, strengths and quotas as ordered."""
 
+import ast
 import hashlib
 import json
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
+import studies.concealed
 from studies.concealed.generate import generate
 from studies.concealed.truth.campaign import FS, PERIODS
 from studies.concealed.truth.case import Order, make, plan
@@ -108,3 +111,17 @@ def test_plan_keeps_its_quotas():
     targets = Counter(t for o in orders for _, t in o.effects)
     assert max(targets.values()) - min(targets.values()) <= 8
     assert plan(120, 4) == orders != plan(120, 5)
+
+
+def test_the_study_shares_no_code_with_the_package():
+    root = Path(studies.concealed.__file__).parent
+    for file in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
+            assert not any(n.split(".")[0] == "bayes_nlsid" for n in names), file
