@@ -222,6 +222,8 @@ class NumpyStepper:
         np.maximum(self._scale_v, np.abs(v), out=self._scale_v)
         limit = ACCEPT / np.maximum(contraction, SMALLEST_CONTRACTION)
         doubt = (np.abs(eq) > limit * self._scale_q) | (np.abs(ev) > limit * self._scale_v)
+        if held is not None:
+            doubt |= held  # sticking is decided by Newton alone
         return new, (f, fq, fv, held), doubt.any(axis=0)
 
     def _newton(self, q0: Array, v0: Array | None, g: Array, accepted: Array, at: Evaluated, active: NDArray[np.bool_]) -> Array:
