@@ -127,8 +127,8 @@ def call(arguments):
 def main(arguments):
     """`run` and `test`; anything after the word is handed on to nlsid or pytest."""
     if sys.version_info < OLDEST:
-        stop("Python %d.%d or newer is needed, this is %s; run this file with a newer one, for instance python3.12 start.py run."
-             % (*OLDEST, sys.version.split()[0]))
+        needed = ".".join(str(number) for number in OLDEST)
+        stop(f"Python {needed} or newer is needed, this is {sys.version.split()[0]}; run this file with a newer one, for instance python3.12.")
     word, rest = (arguments[0] if arguments else "--help"), list(arguments[1:])
     if word == "run":
         set_up([RUN_LOCK])

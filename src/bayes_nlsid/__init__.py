@@ -22,7 +22,8 @@ _PUBLIC = {
     "LappedBeam": "structure.beam", "lapped_beam": "structure.beam", "oscillator": "structure.chains", "Structure": "structure.structure",
     "read_matrices": "structure.matrices", "guyan": "structure.reduction", "iirs": "structure.reduction",
     "identify_modes": "structure.identify", "polarity": "structure.polarity", "update": "structure.updating",
-    "modal_model": "structure.modal_model", "ModalModel": "structure.modal", "modal_data": "structure.sensing", "ModalData": "structure.modal",
+    "modal_model": "structure.modal_model", "ModalModel": "structure.modal", "modal_data": "structure.sensing",
+           "ModalData": "structure.modal",
     # force laws and models
     "Term": "forces.term", "Param": "forces.parameter", "LIBRARY": "forces.library", "user_term": "forces.expression",
     "Element": "model", "Model": "model",

@@ -44,7 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    top = argparse.ArgumentParser(prog="nlsid", description="Nonlinear models of jointed structures from recordings, with their uncertainty.",
+    top = argparse.ArgumentParser(prog="nlsid", description="Nonlinear models of jointed structures from recordings, with their "
+                                                            "uncertainty.",
                                   epilog="Exit status: 0 done, 1 done but the answer is a refusal (the reason is printed and stored), "
                                          "2 bad input, 130 stopped.")
     top.add_argument("--version", action="version", version=f"bayes_nlsid {__version__}")

@@ -17,7 +17,8 @@ CASES = {
     "misspelt table": ("[prediction]", "[predictions]", ["predictions", "did you mean 'prediction'"]),
     "unknown kind": ('kind = "oscillator"\nmass', 'kind = "oscilator"\nmass', ["[structure] kind", "did you mean 'oscillator'"]),
     "text for a number": ("mass = 1.0 ", 'mass = "heavy" ', ["[structure] mass", "does not begin with a number"]),
-    "wrong dimension": ('frequency = "20 Hz"', 'frequency = "20 mm"', ["[structure] frequency", "'mm' is not a unit of frequency", "Hz, kHz"]),
+    "wrong dimension": ('frequency = "20 Hz"', 'frequency = "20 mm"', ["[structure] frequency", "'mm' is not a unit of frequency",
+                                                                       "Hz, kHz"]),
     "negative mass": ("mass = 1.0 ", "mass = -1.0 ", ["[structure] mass", "not positive"]),
     "both stiffness and frequency": ("mass = 1.0 ", "stiffness = 3.0\nmass = 1.0 ", ["[structure] stiffness", "give one of them"]),
     "no title": ('title = "My first study: an oscillator with a hardening spring"', "", ["title: is missing"]),
@@ -32,7 +33,8 @@ CASES = {
     "unit of another quantity": ('unit = "m/s^2"', 'unit = "mm"', ["unit", "measures displacement", "acceleration"]),
     "volts without sensitivity": ('unit = "m/s^2"', 'unit = "V"', ["unit", "voltage", "per_volt"]),
     "unknown quantity": ('quantity = "acceleration" ', 'quantity = "jerk" ', ["quantity", "'jerk' is not possible"]),
-    "unknown location": ('unit = "N"\nlocation = "x"', 'unit = "N"\nlocation = "tip"', ["[[recordings.channels]] 2 location", "'tip'", "known are x"]),
+    "unknown location": ('unit = "N"\nlocation = "x"', 'unit = "N"\nlocation = "tip"', ["[[recordings.channels]] 2 location", "'tip'",
+                                                                                        "known are x"]),
     "polarity of zero": ('unit = "N"\n', 'unit = "N"\npolarity = 0\n', ["polarity", "is 0"]),
     "recording twice": ('name = "later part"', 'name = "multisine"', ["[[recordings]] 2 name", "used twice"]),
     "like nothing above": ('like = "multisine"', 'like = "multisin"', ["like", "did you mean 'multisine'"]),
@@ -51,11 +53,14 @@ CASES = {
     "held out unknown": ('heldout = ["later part"]', 'heldout = ["last part"]', ["heldout", "no recording 'last part'", "'later part'"]),
     "no structure": ("[structure] ", "[structures] ", ["[structure]", "is missing"]),
     "not TOML": ("seed = 1", "seed = = 1", ["is not valid TOML", "line 5"]),
-    "own term unusable": ("[posterior]", '[[terms]]\nname = "mine"\nformula = "c*import"\nparams = { c = ["N", "coefficient"] }\n[posterior]',
+    "own term unusable": ("[posterior]", '[[terms]]\nname = "mine"\nformula = "c*import"\nparams = { c = ["N", "coefficient"] '
+                                         '}\n[posterior]',
                           ["[[terms]] 1", "formula"]),
-    "own term of a taken name": ("[posterior]", '[[terms]]\nname = "cubic"\nformula = "c*q"\nparams = { c = ["N/m", "coefficient"] }\n[posterior]',
+    "own term of a taken name": ("[posterior]", '[[terms]]\nname = "cubic"\nformula = "c*q"\nparams = { c = ["N/m", "coefficient"] '
+                                                '}\n[posterior]',
                                  ["[[terms]] 1 name", "already a term"]),
-    "own parameter misread": ("[posterior]", '[[terms]]\nname = "m"\nformula = "c*q"\nparams = { c = "N/m" }\n[posterior]', ["params", "c"]),
+    "own parameter misread": ("[posterior]", '[[terms]]\nname = "m"\nformula = "c*q"\nparams = { c = "N/m" }\n[posterior]',
+                              ["params", "c"]),
 }
 
 

@@ -129,7 +129,8 @@ store.save("read", "new", {"a": np.ones(3)}, {}, 0.0)
     root = Path(__file__).resolve().parents[2]
     for step in (1, 2, 3):
         out = tmp_path / str(step)
-        done = subprocess.run([sys.executable, "-c", code, str(out), str(step)], env={**os.environ, "PYTHONPATH": str(root / "src")}, check=False)
+        done = subprocess.run([sys.executable, "-c", code, str(out), str(step)], env={**os.environ, "PYTHONPATH": str(root / "src")},
+                              check=False)
         store = Store(out)
         store.sweep()
         saved = store.load("read")

@@ -1,6 +1,7 @@
 """Figures of the recording and of the linear model, and the style all figures share.
 
-Only this module and its siblings ``figures_*.py`` import matplotlib; figures are built as objects without pyplot, so nothing global changes.
+Only this module and its siblings ``figures_*.py`` import matplotlib; figures are built as objects without pyplot, so nothing
+global changes.
 Colours are those of Okabe and Ito, which people with any colour vision can tell apart; line style or marker repeats what colour says.
 """
 
@@ -136,7 +137,8 @@ def _draw_windows(axes: Axes, windows: Sequence[tuple[str, float, float]], end: 
             axes.axvspan(start, stop, color=color, alpha=0.14, linewidth=0)
         if labelled:
             level = 1.05 + 0.13 * k
-            axes.plot([start, min(stop, end)], [level, level], transform=axes.get_xaxis_transform(), color=color, linewidth=3, clip_on=False)
+            axes.plot([start, min(stop, end)], [level, level], transform=axes.get_xaxis_transform(), color=color, linewidth=3,
+                      clip_on=False)
             axes.text(start, level + 0.015, name, transform=axes.get_xaxis_transform(), color=color, fontsize=7.5, va="bottom", ha="left")
 
 
@@ -168,7 +170,8 @@ def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac:
     place = np.arange(k)
     if before is not None:
         left.plot(100 * (before / measured["frequency"] - 1), place, "o", color=GREY, mfc="white", label="model as stated")
-    left.errorbar(100 * (model["frequency"] / measured["frequency"] - 1), place, xerr=165 * measured["frequency_sd"] / measured["frequency"],
+    left.errorbar(100 * (model["frequency"] / measured["frequency"] - 1), place,
+                  xerr=165 * measured["frequency_sd"] / measured["frequency"],
                   fmt="s", color=BLUE, capsize=2.5, label="model updated (bar: 90 % of the measurement)")
     left.axvline(0, color="black", linewidth=0.8)
     left.set(yticks=place, yticklabels=[f"mode {n}\n{f:.4g} Hz" for n, f in zip(numbers, measured["frequency"], strict=True)],
@@ -177,7 +180,8 @@ def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac:
     middle.set(yticks=place, yticklabels=numbers, xlabel="damping measured (% of critical)", ylim=(k - 0.5, -0.5), ylabel="mode")
     image = right.imshow(mac, vmin=0, vmax=1, cmap="cividis")
     right.grid(False)
-    right.set(xticks=place, yticks=place, xticklabels=numbers, yticklabels=numbers, xlabel="model mode", ylabel="measured mode", title="MAC")
+    right.set(xticks=place, yticks=place, xticklabels=numbers, yticklabels=numbers, xlabel="model mode", ylabel="measured mode",
+              title="MAC")
     for i in range(k):
         for j in range(k):
             right.text(j, i, f"{mac[i, j]:.2f}", ha="center", va="center", fontsize=7, color="white" if mac[i, j] < 0.55 else "black")

@@ -41,7 +41,8 @@ def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mappin
     if points:
         x, y = np.array(points, dtype=float).T
         ok = np.isfinite(y) & (y > 0)
-        left.plot(x[ok] + rng.uniform(-0.16, 0.16, ok.sum()), y[ok], ".", color=GREY, alpha=0.55, markersize=4, label="every candidate tried")
+        left.plot(x[ok] + rng.uniform(-0.16, 0.16, ok.sum()), y[ok], ".", color=GREY, alpha=0.55, markersize=4,
+                  label="every candidate tried")
     for phase, marker, color in (("forward", "o", BLUE), ("backward", "s", RED)):
         chosen = [i + 1 for i, s in enumerate(steps) if s["phase"] == phase]
         if chosen:
@@ -60,7 +61,8 @@ def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mappin
 
 def _first_ranking(axes: Axes, tried: Sequence[Mapping[str, object]], floor: float | None, linear: float) -> None:
     """The best dozen candidates of the first step."""
-    first = sorted(((float(str(t["mse"])), str(t["name"])) for t in tried if int(str(t["step"])) == 0 and np.isfinite(float(str(t["mse"])))))[:12]
+    first = sorted((float(str(t["mse"])), str(t["name"])) for t in tried if int(str(t["step"])) == 0
+                   and np.isfinite(float(str(t["mse"]))))[:12]
     if not first:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "the form was given,\nnothing to choose from", ha="center", va="center", color=GREY, transform=axes.transAxes)

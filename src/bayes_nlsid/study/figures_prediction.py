@@ -78,12 +78,14 @@ def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | N
             axes.plot(fa * np.asarray(rival["amplitude"]), factor * np.asarray(rival[key]), linestyle=("--", ":", "-.")[k % 3],
                       color=(GREEN, ORANGE, GREY)[k % 3], label=f"{rival['name']} (fit)")
         if measured is not None:
-            axes.plot(fa * measured["amplitude"], factor * measured[key], "o", color=RED, markersize=3.4, mfc="white", label="measured directly")
+            axes.plot(fa * measured["amplitude"], factor * measured[key], "o", color=RED, markersize=3.4, mfc="white",
+                      label="measured directly")
         for k, span in enumerate(published):
             limits = span.get(key)
             if limits is not None:
                 low, high = np.asarray(limits, dtype=float)
-                axes.axhspan(factor * low, factor * high, color=CYCLE[(k + 2) % len(CYCLE)], alpha=0.10, linewidth=0, label=str(span["label"]))
+                axes.axhspan(factor * low, factor * high, color=CYCLE[(k + 2) % len(CYCLE)], alpha=0.10, linewidth=0,
+                             label=str(span["label"]))
         axes.set_xscale("log")
         axes.set_xlabel(f"amplitude at {location} ({ua})" if location else f"amplitude ({ua})")
     _limit(left, [bands["frequency_q05"], bands["frequency_q95"], *([measured["frequency"]] if measured else [])])
@@ -140,7 +142,8 @@ def heldout_overlay(time: Array, measured: Array, low: Array, middle: Array, hig
         axes = figure.add_subplot(grid[1, k])
         i, j = np.searchsorted(time, [centre, centre + zoom])
         part = slice(max(0, int(i)), max(int(j), int(i) + 2))
-        axes.fill_between(time[part], factor * low[part], factor * high[part], color=BLUE, alpha=0.3, linewidth=0, label=f"predicted, {BAND}")
+        axes.fill_between(time[part], factor * low[part], factor * high[part], color=BLUE, alpha=0.3, linewidth=0,
+                          label=f"predicted, {BAND}")
         axes.plot(time[part], factor * middle[part], color=BLUE, linewidth=1.0, label="median")
         axes.plot(time[part], factor * measured[part], color="black", linewidth=0.9, linestyle="--", label="measured")
         axes.set(xlim=(time[part][0], time[part][-1]), ylabel=sign if k == 0 else None)

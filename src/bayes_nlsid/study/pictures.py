@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
+from bayes_nlsid.study.progress import Progress
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
 
@@ -26,14 +27,15 @@ class Picture:
     png: bytes
 
 
-def draw_all(study: Study, done: Mapping[str, Saved], progress: Callable[[float, str], None] = lambda share, sentence: None) -> list[Picture]:
+def draw_all(study: Study, done: Mapping[str, Saved], progress: Progress | None = None) -> list[Picture]:
     """Every picture that the finished stages allow, in the order of the report."""
     makers: list[tuple[str, Callable[[Study, Mapping[str, Saved]], list[Picture]]]] = [
         ("read", _recordings), ("linear", _linear), ("identify", _selection), ("posterior", _posterior), ("predict", _backbone),
         ("predict", _loops), ("predict", _heldout)]
     out: list[Picture] = []
     for i, (stage, maker) in enumerate(makers):
-        progress(i / len(makers), "drawing")
+        if progress is not None:
+            progress(i / len(makers), "drawing")
         if stage in done:
             out += maker(study, done)
     return out
@@ -57,8 +59,9 @@ def _recordings(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
         image = png(recording_overview, time, signals, view["labels"], view["units"], windows=windows, band=band, modes=modes,
                     noise=(np.asarray(saved.arrays[f"{view['noise']}.noise_frequency"]), full))
         roles = "; ".join(f"{w['name']}: {w['role']}" for w in view["windows"])
-        out.append(Picture(f"recording_{k + 1}", "recordings", f"What was measured ({roles}): every channel against time, and its amplitude "
-                           "spectrum with the noise floor, the band used and the modes found.", "stages/read", image))
+        caption = (f"What was measured ({roles}): every channel against time, and its amplitude spectrum with the noise floor, the band "
+                   "used and the modes found.")
+        out.append(Picture(f"recording_{k + 1}", "recordings", caption, "stages/read", image))
     return out
 
 
@@ -81,10 +84,11 @@ def _linear(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
                       "at_sensors": np.stack([np.interp(x, along, column) for column in line.T], axis=1)}
     image = png(linear_model, {"frequency": np.array([r["measured_hz"] for r in rows]), "zeta": np.array([r["zeta"] for r in rows]),
                                "frequency_sd": np.array([r["measured_sd"] for r in rows]), "number": np.array([r["number"] for r in rows])},
-                {"frequency": np.array([r["model_hz"] for r in rows])}, np.asarray(saved.arrays["mac"], dtype=float), shapes=shapes, before=stated)
-    return [Picture("linear_model", "linear", "The linear model against the modes measured at low level: frequency error before and after updating, "
-                    "measured damping, modal assurance criterion at the sensors" + (", and mode shapes." if shapes else "."),
-                    "stages/linear", image)]
+                {"frequency": np.array([r["model_hz"] for r in rows])}, np.asarray(saved.arrays["mac"], dtype=float), shapes=shapes,
+                before=stated)
+    caption = ("The linear model against the modes measured at low level: frequency error before and after updating, measured damping, "
+               "modal assurance criterion at the sensors" + (", and mode shapes." if shapes else "."))
+    return [Picture("linear_model", "linear", caption, "stages/linear", image)]
 
 
 def _selection(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
@@ -103,9 +107,9 @@ def _selection(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
         tried = [t for t in tried if t["step"] < max(1, len(steps))]
         image = png(selection_path, steps, tried, floor=record["floor"], linear=record["mse_linear"])
         title = "" if v == 0 else f" (alternative “{record['name']}”)"
-        out.append(Picture(f"selection_{v + 1}", "selection", f"Forward–backward selection{title}: the score after each accepted step, every candidate "
-                           "tried for it, and the ranking of the first step. The dashed line is what sensor noise alone would leave.",
-                           "stages/identify", image))
+        caption = (f"Forward–backward selection{title}: the score after each accepted step, every candidate tried for it, and the ranking "
+                   "of the first step. The dashed line is what sensor noise alone would leave.")
+        out.append(Picture(f"selection_{v + 1}", "selection", caption, "stages/identify", image))
     return out
 
 
@@ -128,12 +132,13 @@ def _posterior(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     fit, prior = np.asarray(done["identify"].arrays["0.theta"], dtype=float), saved.arrays.get("prior_draws")
     order = worst_first(saved)
     first = png(posterior_marginals, flat, names, units, prior=prior, fit=fit, identifiable=saved.data["identifiable"])
-    out = [Picture("posterior", "posterior", "Every parameter: posterior, prior (dashed), least-squares value and 90 % interval. Where the posterior "
-                   "follows the prior, the recordings say nothing.", "stages/posterior", first)]
+    caption = ("Every parameter: posterior, prior (dashed), least-squares value and 90 % interval. Where the posterior follows the prior, "
+               "the recordings say nothing.")
+    out = [Picture("posterior", "posterior", caption, "stages/posterior", first)]
     if len(names) > 1:
         second = png(posterior_pairs, flat, names, units, worst=order, fit=fit)
-        out.append(Picture("posterior_pairs", "posterior", "The parameters that the recordings narrow least, pairwise (+ marks least squares).",
-                           "stages/posterior", second))
+        caption = "The parameters that the recordings narrow least, pairwise (+ marks least squares)."
+        out.append(Picture("posterior_pairs", "posterior", caption, "stages/posterior", second))
     third = png(convergence, np.asarray(saved.arrays["log_prob"], dtype=float), theta, names, units,
                 kept_from=int(saved.data.get("burn_in", 0)), worst=order)
     out.append(Picture("convergence", "posterior", "Convergence of the sampler: independent ensembles must lie on top of each other.",
@@ -155,8 +160,9 @@ def _backbone(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     published = [{"label": p.label, "frequency": p.frequency, "damping": p.damping} for p in study.report.published]
     image = png(backbone_bands, arrays, measured, location=data["at"], alternatives=rivals, published=published,
                 numerical=arrays.get("numerical_error_frequency"))
-    return [Picture("backbone", "prediction", f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND} Circles "
-                    "are measured directly from the recording by zero crossings and were not fitted.", "stages/predict, backbone.npz", image)]
+    caption = (f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND} Circles are measured directly "
+               "from the recording by zero crossings and were not fitted.")
+    return [Picture("backbone", "prediction", caption, "stages/predict, backbone.npz", image)]
 
 
 def _loops(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
@@ -168,8 +174,9 @@ def _loops(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
              for i, entry in enumerate(saved.data.get("loops", []))]
     if not loops:
         return []
-    return [Picture("joint_loops", "prediction", "Force of every joint beyond the linear model over one steady cycle at the amplitude of the "
-                    "largest recorded motion; thin lines are single posterior draws.", "stages/predict", png(joint_loops, loops))]
+    caption = ("Force of every joint beyond the linear model over one steady cycle at the amplitude of the largest recorded motion; thin "
+               "lines are single posterior draws.")
+    return [Picture("joint_loops", "prediction", caption, "stages/predict", png(joint_loops, loops))]
 
 
 def _heldout(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
@@ -183,10 +190,12 @@ def _heldout(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
         if not np.isfinite(arrays["q50"]).all():
             continue
         c = int(np.argmax(arrays["measured"].std(axis=0)))
-        facts = f"NRMSE {100 * entry['nrmse']:.3g} %, noise floor {100 * entry['noise_floor']:.2g} %, coverage of the 90 % band {100 * entry['coverage90']:.0f} %"
-        image = png(heldout_overlay, arrays["time"], arrays["measured"][:, c], arrays["q05"][:, c], arrays["q50"][:, c], arrays["q95"][:, c],
-                    unit=entry["units"][c], channel=f"{entry['record']}, {entry['channels'][c]}", zoom=entry["zoom"], facts=facts,
-                    noise=entry["noise_rms"][c])
-        out.append(Picture(f"heldout_{i + 1}", "prediction", f"Record “{entry['record']}”, not used for fitting: simulated forward from its start, "
-                           f"strongest channel. {CAPTION_BAND}", "stages/predict", image))
+        facts = (f"NRMSE {100 * entry['nrmse']:.3g} %, noise floor {100 * entry['noise_floor']:.2g} %, coverage of the 90 % band "
+                 f"{100 * entry['coverage90']:.0f} %")
+        shown = {name: arrays[name][:, c] for name in ("measured", "q05", "q50", "q95")}
+        image = png(heldout_overlay, arrays["time"], *shown.values(), unit=entry["units"][c], zoom=entry["zoom"], facts=facts,
+                    channel=f"{entry['record']}, {entry['channels'][c]}", noise=entry["noise_rms"][c])
+        caption = (f"Record “{entry['record']}”, not used for fitting: simulated forward from its start, strongest channel. "
+                   f"{CAPTION_BAND}")
+        out.append(Picture(f"heldout_{i + 1}", "prediction", caption, "stages/predict", image))
     return out

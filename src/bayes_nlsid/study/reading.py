@@ -89,7 +89,8 @@ def _check_order(file: Path, identification: bool, posterior: bool, prediction: 
     needs = [("posterior", posterior, "identification", identification), ("prediction", prediction, "identification", identification)]
     for asked, present, needed, there in needs:
         if present and not there:
-            raise InputError(f"{file.name}: [{asked}]", f"needs a table [{needed}], which is missing", f"add [{needed}] or remove [{asked}]")
+            raise InputError(f"{file.name}: [{asked}]", f"needs a table [{needed}], which is missing",
+                             f"add [{needed}] or remove [{asked}]")
     if identification and not any(r.role == "train" for r in recordings):
         raise InputError(f"{file.name}: [[recordings]]", 'none has role = "train", so there is nothing to identify from',
                          'give one of them role = "train"')
@@ -170,7 +171,8 @@ def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
     array, column = table.text("array"), table.integer("column", None)
     if polarity == 0 or per_volt == 0:
         key = "polarity" if polarity == 0 else "per_volt"
-        raise table.wrong(key, "is 0", "write 1, or -1 for a sensor mounted the other way round" if key == "polarity" else "give the sensitivity")
+        raise table.wrong(key, "is 0", "write 1, or -1 for a sensor mounted the other way round" if key == "polarity"
+                          else "give the sensitivity")
     table.close()
     return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt)
 

@@ -57,7 +57,8 @@ def _beam(table: Table) -> StructureEntry:
         elif name == "bolts":
             value = tuple((t.number("at", "length"), t.number("mass", "mass")) for t in _closing(table, name, ("at", "mass")))
         elif name == "masses":
-            value = tuple((t.text("name"), t.number("at", "length"), t.number("mass", "mass")) for t in _closing(table, name, ("name", "at", "mass")))
+            value = tuple((t.text("name"), t.number("at", "length"), t.number("mass", "mass"))
+                          for t in _closing(table, name, ("name", "at", "mass")))
         elif name in _SERIES:
             value = table.numbers(name, _DIMENSION[name], default)
         elif name in _SPRINGS:
@@ -112,7 +113,7 @@ def _matrices(table: Table) -> StructureEntry:
         if table.has(key):
             files.append((key, table.path(key)))
     if not archive and len(files) == 1:
-        raise table.wrong("stiffness", "is missing", "name the stiffness matrix that belongs to the mass matrix, or give one npz archive as mass")
+        raise table.wrong("stiffness", "is missing", "name the stiffness matrix that goes with mass, or give one npz archive as mass")
     values = {key: table.texts(key, None) for key in GROUPS}
     return StructureEntry("matrices", tuple((k, v) for k, v in values.items() if v is not None), tuple(files))
 
@@ -142,6 +143,7 @@ def read_reduction(table: Table | None, structure: StructureEntry) -> ReductionE
     entry = ReductionEntry(method, masters, table.integer("modes", None, low=1), table.integer("iterations", 30, low=1),
                            table.number("damping", "ratio", 1e-3, positive=True))
     if method == "none" and table.has("masters"):
-        raise table.wrong("masters", "is given, but method is none", f"write a method ({nearest('iirs', ('guyan', 'iirs'))}), or remove masters")
+        raise table.wrong("masters", "is given, but method is none",
+                          f"write a method ({nearest('iirs', ('guyan', 'iirs'))}), or remove masters")
     table.close()
     return entry

@@ -51,7 +51,8 @@ def render(report: Report) -> str:
     parts = [part for part in parts if part[2]]
     links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title, _ in parts)
     told = "".join(html.paragraph(sentence) for sentence in story(report.study, report.result))
-    body = [f'<p class="soft">bayes_nlsid {escape(str(report.result["versions"].get("bayes_nlsid", "")))}, seed {report.result["seed"]}</p>',
+    body = [f'<p class="soft">bayes_nlsid {escape(str(report.result["versions"].get("bayes_nlsid", "")))}, seed '
+            f'{report.result["seed"]}</p>',
             f"<h1>{escape(report.study.title)}</h1>", f"<p>{badge}</p>", f'<div class="story">{told}</div>', f"<nav>{links}</nav>"]
     body += [f'<section id="{name}"><h2>{escape(title)}</h2>{content}</section>' for name, title, content in parts]
     return html.page(report.study.title, "\n".join(body))
@@ -69,24 +70,29 @@ def _recordings(report: Report) -> str:
     rows, findings = [], []
     for record in saved.data["recordings"]:
         for channel in record["channels"]:
-            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s",
+                         f"{record['rate']:.6g} Hz",
                          f"{channel['peak']:.3g} {unit_sign(channel['unit'])}", f"{channel['noise_rms']:.2g} {unit_sign(channel['unit'])}"])
         for channel in record["inputs"]:
-            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s",
+                         f"{record['rate']:.6g} Hz",
                          f"{channel['peak']:.3g} N", "–"])
         findings += [f"{record['name']}, {f['channel']}: {f['sentence']}" if f["channel"] else f"{record['name']}: {f['sentence']}"
                      for f in record["findings"]]
     head = ["recording", "role", "channel", "location", "length", "rate", "peak", "noise (rms)"]
     how = list(dict.fromkeys(f"Noise floor: {r['noise']}" for r in saved.data["recordings"]))
-    return html.table(head, rows, "stages/read", numeric=(4, 5, 6, 7)) + html.listing(findings) + "".join(html.paragraph(h, "soft") for h in how[:3])
+    said = "".join(html.paragraph(sentence, "soft") for sentence in how[:3])
+    return html.table(head, rows, "stages/read", numeric=(4, 5, 6, 7)) + html.listing(findings) + said
 
 
 def _linear(report: Report) -> str:
     saved = report.done.get("linear")
     if saved is None:
         return ""
-    rows = [[str(m["number"]), f"{m['measured_hz']:.4g} ± {m['measured_sd']:.1g}", "–" if m["stated_hz"] is None else f"{m['stated_hz']:.4g}",
-             f"{m['model_hz']:.4g}", f"{100 * (m['model_hz'] / m['measured_hz'] - 1):+.2f} %", f"{100 * m['zeta']:.3g} ± {100 * m['zeta_sd']:.1g} %",
+    rows = [[str(m["number"]), f"{m['measured_hz']:.4g} ± {m['measured_sd']:.1g}", "–" if m["stated_hz"] is None
+             else f"{m['stated_hz']:.4g}",
+             f"{m['model_hz']:.4g}", f"{100 * (m['model_hz'] / m['measured_hz'] - 1):+.2f} %",
+             f"{100 * m['zeta']:.3g} ± {100 * m['zeta_sd']:.1g} %",
              f"{m['mac']:.3f}", m["status"]] for m in saved.data["modes"]]
     head = ["mode", "measured (Hz)", "as stated (Hz)", "updated (Hz)", "error left", "damping", "MAC", "remark"]
     out = html.table(head, rows, "stages/linear; ± one standard deviation", numeric=(1, 2, 3, 4, 5, 6))
@@ -104,7 +110,8 @@ def _selection(report: Report) -> str:
     for record in saved.data["variants"]:
         terms = "; ".join(f"{e['term']} at {', '.join(e['locations'])}" for e in record["elements"]) or "none (linear)"
         share = 1 - record["mse"] / record["mse_linear"] if record["mse_linear"] > 0 else 0.0
-        rows.append([record["name"], terms, f"{record['mse_linear']:.3g}", f"{record['mse']:.3g}", f"{record['floor']:.2g}", f"{100 * share:.1f} %",
+        rows.append([record["name"], terms, f"{record['mse_linear']:.3g}", f"{record['mse']:.3g}", f"{record['floor']:.2g}",
+                     f"{100 * share:.1f} %",
                      record["status"]])
     head = ["form", "force laws", "mean square, linear", "with them", "noise floor", "explained", "fit"]
     out = html.table(head, rows, f"stages/identify, scenario {saved.data['scenario']}", numeric=(2, 3, 4, 5))
@@ -113,7 +120,8 @@ def _selection(report: Report) -> str:
     if steps:
         steps_table = html.table(["form", "round", "candidate", "mean square", "accepted", "why"], steps, "stages/identify", numeric=(3,))
         out += f"<details open><summary>Every round of the selection</summary>{steps_table}</details>"
-    alike = [f"{r['name']}: the recordings do not tell {', '.join(r['aliases'])} from what was chosen" for r in saved.data["variants"] if r.get("aliases")]
+    alike = [f"{r['name']}: the recordings do not tell {', '.join(r['aliases'])} from what was chosen" for r in saved.data["variants"]
+             if r.get("aliases")]
     return out + html.listing(alike)
 
 
@@ -133,10 +141,12 @@ def _posterior(report: Report) -> str:
     c = saved.data["convergence"]
     facts = [["ensembles × steps", f"{c['ensembles']} × {c['steps']}"], ["converged", "yes" if c["converged"] else "no"],
              ["largest R-hat over ensembles", f"{c['rhat_max']:.4f}" if c["rhat_max"] is not None else "–"],
-             ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"], ["stuck walkers", str(c["stuck_walkers"])]]
+             ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"],
+             ["stuck walkers", str(c["stuck_walkers"])]]
     out += html.table(["sampler", ""], facts, "stages/posterior")
     priors = [[p["parameter"], p["text"]] for p in saved.data.get("priors", [])]
-    return out + f"<details><summary>What was assumed beforehand (priors)</summary>{html.table(['parameter', 'prior'], priors, 'stages/posterior')}</details>"
+    table = html.table(["parameter", "prior"], priors, "stages/posterior")
+    return out + f"<details><summary>What was assumed beforehand (priors)</summary>{table}</details>"
 
 
 def _prediction(report: Report) -> str:
@@ -144,12 +154,14 @@ def _prediction(report: Report) -> str:
     if saved is None:
         return ""
     rows = [[e["record"], f"{100 * e['nrmse']:.3g} %", f"{100 * e['nrmse_linear']:.3g} %" if e.get("nrmse_linear") is not None else "–",
-             f"{100 * e['noise_floor']:.2g} %", f"{100 * e['coverage90']:.0f} %", engineering(e["rmse"], e["unit"]) if e.get("rmse") is not None else "–"]
+             f"{100 * e['noise_floor']:.2g} %", f"{100 * e['coverage90']:.0f} %", engineering(e["rmse"], e["unit"])
+             if e.get("rmse") is not None else "–"]
             for e in saved.data.get("heldout", [])]
     out = html.table(["record not fitted", "NRMSE", "linear model", "noise floor", "inside 90 % band", "RMSE"], rows, "stages/predict",
                      numeric=(1, 2, 3, 4, 5))
     published = [[p.label, "–" if p.frequency is None else f"{p.frequency[0]:g}–{p.frequency[1]:g} Hz",
-                  "–" if p.damping is None else f"{100 * p.damping[0]:.3g}–{100 * p.damping[1]:.3g} %", p.text] for p in report.study.report.published]
+                  "–" if p.damping is None else f"{100 * p.damping[0]:.3g}–{100 * p.damping[1]:.3g} %", p.text]
+                 for p in report.study.report.published]
     out += html.table(["published by others", "frequency", "damping", ""], published, "the study file")
     return out + html.listing(saved.data.get("notes", []))
 

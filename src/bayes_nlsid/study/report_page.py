@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from html import escape
 
 STYLE = """
-:root { --ink: #1b1f24; --soft: #57606a; --line: #d8dee4; --page: #ffffff; --tint: #f3f6f9; --accent: #0072B2; --good: #007a56; --bad: #b3480a; }
+:root { --ink: #1b1f24; --soft: #57606a; --line: #d8dee4; --page: #ffffff; --tint: #f3f6f9;
+        --accent: #0072B2; --good: #007a56; --bad: #b3480a; }
 @media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --soft: #9aa4ae; --line: #333b44; --page: #14181d; --tint: #1d232a; --accent: #63b3e4; --good: #4cc79c; --bad: #f0935a; }
+  :root { --ink: #e6e9ec; --soft: #9aa4ae; --line: #333b44; --page: #14181d; --tint: #1d232a;
+          --accent: #63b3e4; --good: #4cc79c; --bad: #f0935a; }
   figure img { filter: brightness(.93); border-radius: 4px; }
 }
 * { box-sizing: border-box; }
@@ -22,7 +24,8 @@ p, li { max-width: 46rem; }
 .soft { color: var(--soft); font-size: .88rem; }
 .story { background: var(--tint); border-left: 4px solid var(--accent); padding: .8rem 1.1rem; margin: 1rem 0; border-radius: 0 6px 6px 0; }
 .story p { margin: .45rem 0; }
-.badge { display: inline-block; padding: .1rem .6rem; border-radius: 1rem; font-weight: 600; font-size: .9rem; border: 1.5px solid currentColor; }
+.badge { display: inline-block; padding: .1rem .6rem; border-radius: 1rem;
+          font-weight: 600; font-size: .9rem; border: 1.5px solid currentColor; }
 .ok { color: var(--good); } .warn { color: var(--bad); }
 nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; font-size: .92rem; margin: .8rem 0; }
 a { color: var(--accent); }
@@ -49,7 +52,8 @@ td.hash { font-family: ui-monospace, Consolas, monospace; font-size: .8em; word-
 
 def page(title: str, body: str) -> str:
     """A whole page without any outside resource."""
-    return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, '
+            f'initial-scale=1">'
             f'<meta name="color-scheme" content="light dark"><title>{escape(title)}</title><style>{STYLE}</style></head>\n'
             f"<body><main>\n{body}\n</main></body></html>\n")
 
@@ -70,9 +74,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], source: str, numer
         return ""
     def mark(i: int) -> str:
         return ' class="n"' if i in numeric else ' class="hash"' if i in hashes else ""
+    caption = f"<caption>from {escape(source)}</caption>"
     top = "".join(f"<th{mark(i) if i in numeric else ''}>{escape(text)}</th>" for i, text in enumerate(head))
     body = "".join("<tr>" + "".join(f"<td{mark(i)}>{escape(cell)}</td>" for i, cell in enumerate(row)) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table><caption>from {escape(source)}</caption><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f'<div class="scroll"><table>{caption}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def picture(png: bytes, caption: str, source: str, alternative: str) -> str:

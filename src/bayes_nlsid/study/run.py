@@ -104,7 +104,7 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
         write_atomic(store.out / "posterior.nc", done["posterior"].arrays["netcdf"].tobytes())
     if "predict" in done and "amplitude" in done["predict"].arrays:
         _write_backbone(done["predict"], store.out / "backbone.npz")
-    pictures = draw_all(study, done, told.update if told is not None else (lambda share, sentence: None))
+    pictures = draw_all(study, done, told.update if told is not None else None)
     folder = store.out / "figures"
     folder.mkdir(exist_ok=True)
     for picture in pictures:

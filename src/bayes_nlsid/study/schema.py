@@ -44,7 +44,8 @@ class ReductionEntry:
 class LinearEntry:
     """``[linear]``: where modes are measured and which parts of the structure are updated to them.
 
-    ``modes`` are 1-based; ``update`` names parts of the structure, or groups of parts that share one factor; ``damping`` overrides what is measured, mode by mode; ``use_measured`` puts the measured frequencies into the model for identification.
+    ``modes`` are 1-based; ``update`` names parts of the structure, or groups of parts that share one factor; ``damping`` overrides what
+    is measured, mode by mode; ``use_measured`` puts the measured frequencies into the model for identification.
     """
 
     recording: str | None = None

@@ -51,7 +51,8 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
     if h.get("nrmse") is not None:
         parts.append(f"held out ({', '.join(h['records'])}): NRMSE {100 * h['nrmse']:.3g} %, noise floor {100 * h['noise_floor']:.2g} %, "
                      f"90 % band covers {100 * h['coverage90']:.0f} %")
-    files = ", ".join(name for name in ("report.html", "result.json", "posterior.nc", "backbone.npz", "figures/", "run.log") if (out / name).exists())
+    files = ", ".join(name for name in ("report.html", "result.json", "posterior.nc", "backbone.npz", "figures/", "run.log")
+                      if (out / name).exists())
     return "\n".join([*parts, f"\nin {out}: {files}"])
 
 
@@ -69,7 +70,8 @@ def plan(study: Study) -> str:
         parts.append(_wrapped(f"identification: scenario {entry.scenario}, modes {', '.join(map(str, entry.modes))}, {what}"))
         parts += [_wrapped(f"  beside it: {a.name}, {len(a.candidates)} candidate terms") for a in entry.alternatives]
     if study.posterior is not None:
-        parts.append(f"posterior: {study.posterior.ensembles} ensembles x {study.posterior.steps} steps, {study.posterior.likelihood} likelihood")
+        parts.append(f"posterior: {study.posterior.ensembles} ensembles x {study.posterior.steps} steps, {study.posterior.likelihood} "
+                     f"likelihood")
     if study.prediction is not None:
         p = study.prediction
         parts.append(f"prediction: backbone of mode {p.mode} at {p.at} from {engineering(p.amplitude, 'm')}, {p.samples} samples; "
@@ -78,7 +80,8 @@ def plan(study: Study) -> str:
         (study.linear.recording, "no low-level recording under [linear]: the linear model is used as stated"),
         (study.identification, "no [identification]: only the linear model is made"),
         (study.posterior, "no [posterior]: best values without uncertainty"),
-        (study.prediction and study.prediction.heldout, "no held-out record under [prediction]: nothing tests the prediction")) if not given]
+        (study.prediction and study.prediction.heldout, "no held-out record under [prediction]: nothing tests the prediction"))
+               if not given]
     return "\n".join([*parts, *(f"missing: {text}" for text in missing)])
 
 

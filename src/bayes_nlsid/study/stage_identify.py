@@ -55,7 +55,8 @@ def observed(context: Context, role: str = "train") -> tuple[ModalData, ...]:
     entry, model = entry_of(context), context.model
     unknown = [k for k in entry.modes if k > model.modes]
     if unknown:
-        raise InputError(f"{context.study.file.name}: [identification] modes", f"mode {unknown[0]} does not exist, the model has {model.modes}",
+        raise InputError(f"{context.study.file.name}: [identification] modes",
+                         f"mode {unknown[0]} does not exist, the model has {model.modes}",
                          "raise modes in [reduction], or name lower ones")
     chosen = chosen_scenario(context)
     places = tuple(dict.fromkeys([*entry.joints, *(place for e in _all_elements(entry) for place in e.locations)]))
@@ -113,7 +114,8 @@ def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData,
         problem = bare.with_elements(tuple(known)) if known else bare
         if variant.candidates:
             candidates = _candidates(context, variant, bare, entry)
-            selection = select(problem, candidates, eps1=entry.eps1, eps2=entry.eps2, starts=entry.starts, seed=seed, workers=context.workers,
+            selection = select(problem, candidates, eps1=entry.eps1, eps2=entry.eps2, starts=entry.starts, seed=seed,
+                               workers=context.workers,
                                progress=progress)
             found, linear = selection.fit, selection.mse_linear
         else:

@@ -22,8 +22,8 @@ def linear(context: Context) -> Result:
     Returns
     -------
     arrays, data
-        ``model.*`` is the modal model for identification; ``data["modes"]`` compares measured and modelled modes, ``data["polarity"]`` names
-        channels whose sign disagrees, ``data["updated"]`` lists the parts that were scaled.
+        ``model.*`` is the modal model for identification; ``data["modes"]`` compares measured and modelled modes, ``data["polarity"]``
+        names channels whose sign disagrees, ``data["updated"]`` lists the parts that were scaled.
     """
     study = context.study
     context.progress(0.0, "building the structure")
@@ -32,7 +32,8 @@ def linear(context: Context) -> Result:
     if study.linear.recording is None:
         model = _with_stated_damping(context, nominal)
         arrays, names = model_record(model)
-        return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": [*model.notes, "no low-level recording was named"]}
+        notes = [*model.notes, "no low-level recording was named"]
+        return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": notes}
     from bayes_nlsid.structure.identify import identify_modes
     from bayes_nlsid.structure.polarity import polarity
 
@@ -71,7 +72,8 @@ def _updated(context: Context, structure: Structure | ModalModel, measured: Any)
         found = update(structure, groups, measured)
     except ValueError as error:
         raise InputError(where, str(error), "name parts of the structure") from None
-    rows = [{"part": name, "parts": list(groups[name]), "factor": float(value), "log_sd": float(sd), "identifiable": name not in found.unidentifiable}
+    rows = [{"part": name, "parts": list(groups[name]), "factor": float(value), "log_sd": float(sd),
+             "identifiable": name not in found.unidentifiable}
             for name, value, sd in zip(found.names, found.values, found.sd, strict=True)]
     return found.structure, rows, [] if found.status == "ok" else [f"updating: {found.status}"]
 
@@ -103,7 +105,8 @@ def _with_stated_damping(context: Context, model: ModalModel) -> ModalModel:
     if not stated:
         return model
     if len(stated) > model.modes:
-        raise InputError(f"{context.study.file.name}: [linear] damping", f"{len(stated)} ratios are given for {model.modes} modes", "give fewer")
+        raise InputError(f"{context.study.file.name}: [linear] damping", f"{len(stated)} ratios are given for {model.modes} modes",
+                         "give fewer")
     zeta = model.zeta.copy()
     zeta[:len(stated)] = stated
     return replace(model, zeta=zeta)

@@ -28,14 +28,15 @@ def posterior(context: Context) -> Result:
     Returns
     -------
     arrays, data
-        ``theta`` (M, n, W, P), ``log_prob`` (M, n, W), ``quantiles`` (3, P), ``prior_draws`` (E, P), ``narrowing`` (P,) as posterior over prior
-        width in search coordinates, ``ess``, ``tau`` (P,); ``data["convergence"]`` as in the results file.
+        ``theta`` (M, n, W, P), ``log_prob`` (M, n, W), ``quantiles`` (3, P), ``prior_draws`` (E, P), ``narrowing`` (P,) as posterior over
+        prior width in search coordinates, ``ess``, ``tau`` (P,); ``data["convergence"]`` as in the results file.
     """
     entry = context.study.posterior
     assert entry is not None
     start = stored_fit(context)
     if start.status == "failed":
-        raise InputError(f"{context.study.file.name}: [posterior]", f"the fit failed ({'; '.join(start.reasons)})", "correct the identification first")
+        raise InputError(f"{context.study.file.name}: [posterior]", f"the fit failed ({'; '.join(start.reasons)})",
+                         "correct the identification first")
     if not start.problem.size or not start.problem.names:
         return {"theta": np.zeros((1, 0, 1, 0)), "log_prob": np.zeros((1, 0, 1)), "quantiles": np.zeros((3, 0)), "narrowing": np.zeros(0),
                 "ess": np.zeros(0), "tau": np.zeros(0)}, _empty()
@@ -48,7 +49,8 @@ def posterior(context: Context) -> Result:
     rng = np.random.default_rng(context.random("prior"))
     c = found.convergence
     arrays = {"theta": found.theta, "log_prob": found.log_prob, "quantiles": found.quantiles(), "narrowing": 1 - np.asarray(c.contraction),
-              "ess": np.asarray(c.ess), "tau": np.asarray(c.tau), "prior_draws": np.stack([p.sample(PRIOR_DRAWS, rng) for p in priors], axis=1)}
+              "ess": np.asarray(c.ess), "tau": np.asarray(c.tau),
+              "prior_draws": np.stack([p.sample(PRIOR_DRAWS, rng) for p in priors], axis=1)}
     _keep_whole(context, found, likelihood, arrays)
     data: dict[str, Any] = {
         "names": list(found.names), "units": list(found.units), "identifiable": [bool(x) for x in c.identifiable], "status": found.status,
@@ -61,7 +63,8 @@ def posterior(context: Context) -> Result:
 
 def _empty() -> dict[str, Any]:
     """A linear model without free parameters has nothing to sample."""
-    return {"names": [], "units": [], "identifiable": [], "status": "ok", "reasons": ["the chosen model has no free parameters"], "burn_in": 0,
+    return {"names": [], "units": [], "identifiable": [], "status": "ok", "reasons": ["the chosen model has no free parameters"],
+            "burn_in": 0,
             "priors": [], "likelihood": "", "convergence": {"ensembles": 0, "steps": 0, "walkers": 0, "converged": True, "rhat_max": None,
                                                             "ess_min": None, "stuck_walkers": 0}}
 
@@ -83,7 +86,8 @@ def _priors(context: Context, entry: PosteriorEntry, start: Fit) -> tuple[Prior,
         where = f"{context.study.file.name}: [[posterior.priors]] {i + 1}"
         matched = [k for k, p in enumerate(out) if p.name == stated.parameter or fnmatchcase(p.name, stated.parameter.replace("[", "[[]"))]
         if not matched:
-            raise InputError(where, f"{stated.parameter!r} is none of the parameters {', '.join(p.name for p in out[:8])}", "correct the name")
+            raise InputError(where, f"{stated.parameter!r} is none of the parameters {', '.join(p.name for p in out[:8])}",
+                             "correct the name")
         for k in matched:
             lower = out[k].lower if stated.lower is None else max(stated.lower, out[k].lower)
             upper = out[k].upper if stated.upper is None else min(stated.upper, out[k].upper)

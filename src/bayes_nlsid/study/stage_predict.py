@@ -101,7 +101,8 @@ def _measured(context: Context, entry: PredictionEntry) -> Arrays:
     if found.status != "ok":
         context.note(f"backbone measured from {entry.measured}: {found.status}")
     keep = np.isfinite(found.frequency) & np.isfinite(found.damping)
-    return {"measured.amplitude": found.amplitude[keep], "measured.frequency": found.frequency[keep], "measured.damping": found.damping[keep]}
+    return {"measured.amplitude": found.amplitude[keep], "measured.frequency": found.frequency[keep],
+            "measured.damping": found.damping[keep]}
 
 
 def _alternatives(context: Context, entry: PredictionEntry, amplitude: Array, arrays: Arrays, data: dict[str, Any]) -> None:
@@ -136,13 +137,15 @@ def _heldout(context: Context, entry: PredictionEntry, model: Model, draws: Arra
         context.progress(0.7 + 0.3 * i / len(entry.heldout), f"predicting {name}")
         judged = heldout(model, draws, recording, band=band_of(context, context.model), seed=context.number(f"heldout {name}"))
         linear = heldout(Model(context.model), np.zeros((1, 0)), recording, band=band_of(context, context.model), seed=0)
-        arrays |= {f"held{i}.time": judged.time, f"held{i}.measured": judged.measured, f"held{i}.q05": judged.q05, f"held{i}.q50": judged.q50,
+        arrays |= {f"held{i}.time": judged.time, f"held{i}.measured": judged.measured, f"held{i}.q05": judged.q05,
+                   f"held{i}.q50": judged.q50,
                    f"held{i}.q95": judged.q95}
         period = 1 / context.model.frequency[entry.mode - 1]
+        units = [SI_UNIT[c.quantity] for c in recording.channels]
         data["heldout"].append({
-            "record": name, "nrmse": judged.nrmse, "nrmse_linear": linear.nrmse, "noise_floor": judged.noise_floor, "coverage90": judged.coverage90,
-            "rmse": judged.rmse, "channels": [c.name for c in recording.channels], "units": [SI_UNIT[c.quantity] for c in recording.channels],
-            "unit": SI_UNIT[recording.channels[0].quantity], "noise_rms": judged.noise_rms.tolist(), "zoom": float(6 * period)})
+            "record": name, "nrmse": judged.nrmse, "nrmse_linear": linear.nrmse, "noise_floor": judged.noise_floor,
+            "coverage90": judged.coverage90, "rmse": judged.rmse, "channels": [c.name for c in recording.channels], "units": units,
+            "unit": units[0], "noise_rms": judged.noise_rms.tolist(), "zoom": float(6 * period)})
 
 
 def _summary(arrays: Arrays) -> dict[str, Any]:
@@ -152,7 +155,8 @@ def _summary(arrays: Arrays) -> dict[str, Any]:
         return {}
     a = arrays["amplitude"]
     first, last = int(np.flatnonzero(ok)[0]), int(np.flatnonzero(ok)[-1])
-    out: dict[str, Any] = {"amplitude_m": [a[first], a[last]], "frequency_hz": [arrays["frequency_q50"][first], arrays["frequency_q50"][last]],
+    out: dict[str, Any] = {"amplitude_m": [a[first], a[last]],
+                           "frequency_hz": [arrays["frequency_q50"][first], arrays["frequency_q50"][last]],
                            "damping": [arrays["damping_q50"][first], arrays["damping_q50"][last]],
                            "numerical_error_hz": float(np.nanmax(np.abs(arrays["numerical_error_frequency"])))}
     if "measured.amplitude" in arrays and len(arrays["measured.amplitude"]):

@@ -42,8 +42,9 @@ def read(context: Context) -> Result:
 
 
 def _describe(recording: Recording, noise: Any, how: str) -> dict[str, Any]:
+    peaks = np.abs(recording.response).max(axis=0)
     channels = [{"name": c.name, "location": c.location, "quantity": c.quantity, "unit": SI_UNIT[c.quantity], "file_unit": c.unit,
-                 "polarity": c.polarity, "rms": float(np.std(recording.response[:, k])), "peak": float(np.abs(recording.response[:, k]).max()),
+                 "polarity": c.polarity, "rms": float(np.std(recording.response[:, k])), "peak": float(peaks[k]),
                  "noise_rms": float(noise[k])} for k, c in enumerate(recording.channels)]
     inputs = [{"name": c.name, "location": c.location, "unit": "N", "rms": float(np.std(recording.force[:, k])),
                "peak": float(np.abs(recording.force[:, k]).max())} for k, c in enumerate(recording.inputs)]

@@ -23,10 +23,12 @@ def _found(result: Mapping[str, Any]) -> str:
     chosen = result.get("selection")
     if chosen is None:
         modes = result.get("linear", {}).get("modes", [])
-        return f"The linear model matches {len(modes)} measured modes; no identification was asked for." if modes else "The recordings were read."
+        linear = f"The linear model matches {len(modes)} measured modes; no identification was asked for."
+        return linear if modes else "The recordings were read."
     score = chosen["score"]
     if not chosen["terms"]:
-        return "No force law of the library explains more than the linear model does; the structure is linear as far as these recordings can tell."
+        return ("No force law of the library explains more than the linear model does; the structure is linear as far as these "
+                "recordings can tell.")
     terms = " and ".join(f"{t['name']} at {', '.join(t['locations'])}" for t in chosen["terms"])
     share = 100 * (1 - score["mse"] / score["mse_linear"]) if score["mse_linear"] else 0.0
     way = "was chosen from the library" if chosen["forward"] else "was given as the form"
@@ -52,8 +54,9 @@ def _sure(result: Mapping[str, Any]) -> str:
     said = f"The recordings determine {len(tight)} of {len(rows)} parameters"
     if tight and tight[0]["q50"] is not None:
         best = min(tight, key=lambda p: p.get("narrowing", 1.0))
-        said += (f", best {best['name']}: {engineering(best['q50'], best['unit'])}, 90 % between {engineering(best['q05'], best['unit'])} and "
-                 f"{engineering(best['q95'], best['unit'])}")
+        unit = best["unit"]
+        said += (f", best {best['name']}: {engineering(best['q50'], unit)}, 90 % between {engineering(best['q05'], unit)} and "
+                 f"{engineering(best['q95'], unit)}")
     return said + (f"; not determined are {', '.join(loose[:6])}{' and others' if len(loose) > 6 else ''}." if loose else ".")
 
 
@@ -74,9 +77,9 @@ def _heldout(result: Mapping[str, Any]) -> str:
     h = result.get("heldout") or {}
     if not h.get("records") or h.get("nrmse") is None:
         return ""
-    return (f"On {len(h['records'])} record{'s' if len(h['records']) > 1 else ''} not used for fitting the simulated response errs by "
-            f"{100 * h['nrmse']:.3g} % (sensor noise alone {100 * h['noise_floor']:.2g} %), and {100 * h['coverage90']:.0f} % of the samples lie inside "
-            "the 90 % band.")
+    records = f"{len(h['records'])} record{'s' if len(h['records']) > 1 else ''}"
+    return (f"On {records} not used for fitting the simulated response errs by {100 * h['nrmse']:.3g} % (sensor noise alone "
+            f"{100 * h['noise_floor']:.2g} %), and {100 * h['coverage90']:.0f} % of the samples lie inside the 90 % band.")
 
 
 def _next(result: Mapping[str, Any]) -> str:
@@ -90,8 +93,8 @@ def _next(result: Mapping[str, Any]) -> str:
         return "Next: record larger amplitudes, or tie the joints' parameters, before trusting any value of the nonlinear part."
     h, b = result.get("heldout") or {}, result.get("backbone") or {}
     if h.get("coverage90") is not None and h["coverage90"] < 0.75:
-        return ("Next: the band is too narrow on records it has not seen, so something is missing in the model; find it with nlsid diagnose, and do "
-                "not extrapolate until then.")
+        return ("Next: the band is too narrow on records it has not seen, so something is missing in the model; find it with nlsid "
+                "diagnose, and do not extrapolate until then.")
     if b.get("inside_damping") is not None and min(b["inside_damping"], b["inside_frequency"]) < 0.6:
         return "Next: the measured backbone leaves the band; find what is missing with nlsid diagnose before extrapolating."
     if "parameters" in result and not any("identifiable" in p for p in result["parameters"]):

@@ -50,7 +50,8 @@ def _verdict(done: Mapping[str, Saved]) -> tuple[str, list[str]]:
     if "posterior" in done:
         data = done["posterior"].data
         reasons += data["reasons"]
-        flags = [f for f, name in zip(data["identifiable"], data["names"], strict=True) if "[" in name and not name.startswith(("f[", "zeta["))]
+        linear = ("f[", "zeta[")
+        flags = [f for f, name in zip(data["identifiable"], data["names"], strict=True) if not name.startswith(linear)]
         if not data["convergence"]["converged"]:
             status = "not_converged"
         elif flags and not any(flags):
@@ -76,7 +77,8 @@ def _selection(record: Mapping[str, Any]) -> dict[str, Any]:
 def _parameters(done: Mapping[str, Saved]) -> list[dict[str, Any]]:
     record = done["identify"].data["variants"][0]
     fit = np.asarray(done["identify"].arrays["0.theta"], dtype=float)
-    rows: list[dict[str, Any]] = [{"name": n, "unit": u, "fit": float(x)} for n, u, x in zip(record["names"], record["units"], fit, strict=True)]
+    named = zip(record["names"], record["units"], fit, strict=True)
+    rows: list[dict[str, Any]] = [{"name": name, "unit": unit, "fit": float(value)} for name, unit, value in named]
     if "posterior" in done:
         saved = done["posterior"]
         quantiles = np.asarray(saved.arrays["quantiles"], dtype=float)
@@ -91,9 +93,10 @@ def _heldout(saved: Saved) -> dict[str, Any]:
     entries = saved.data.get("heldout", [])
     if not entries:
         return {"records": [], "nrmse": None, "noise_floor": None, "coverage90": None}
+    kept = ("record", "nrmse", "nrmse_linear", "noise_floor", "coverage90", "rmse", "unit")
     return {"records": [e["record"] for e in entries],
-            **{key: float(np.mean([e[key] for e in entries])) for key in ("nrmse", "noise_floor", "coverage90")}, "each": [
-                {key: e[key] for key in ("record", "nrmse", "nrmse_linear", "noise_floor", "coverage90", "rmse", "unit") if key in e} for e in entries]}
+            **{key: float(np.mean([e[key] for e in entries])) for key in ("nrmse", "noise_floor", "coverage90")},
+            "each": [{key: e[key] for key in kept if key in e} for e in entries]}
 
 
 def _finite(value: Any) -> Any:

@@ -68,7 +68,8 @@ class Table:
             return self._content[key]
         if default is _REQUIRED:
             close = difflib.get_close_matches(key, list(self._content), n=1, cutoff=0.75)
-            mend = f"{close[0]!r} is perhaps meant to be {key!r}" if close else f"add {key} = ... " + (f"under {self.name}" if self.name else "at the top")
+            place = f"under {self.name}" if self.name else "at the top"
+            mend = f"{close[0]!r} is perhaps meant to be {key!r}" if close else f"add {key} = ... {place}"
             raise self.wrong(key, "is missing", mend)
         return default
 
@@ -102,7 +103,8 @@ class Table:
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.wrong(key, f"is {self._kind(value)}, not a whole number", f"write {key} = {low} or more")
         if value < low or (high is not None and value > high):
-            raise self.wrong(key, f"{value} is out of range", f"write a whole number from {low}" + (f" to {high}" if high is not None else " up"))
+            limit = f"to {high}" if high is not None else "up"
+            raise self.wrong(key, f"{value} is out of range", f"write a whole number from {low} {limit}")
         return value
 
     def number(self, key: str, dimension: str = "number", default: Any = _REQUIRED, *, positive: bool = False) -> Any:

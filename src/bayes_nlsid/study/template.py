@@ -145,4 +145,5 @@ def example_recording() -> dict[str, np.ndarray]:
         state = state + h / 6 * (a + 2 * b + 2 * c + slope(state + h * c, force[2 * i + 2]))
     acceleration = np.array(states)
     noise = 2e-3 * acceleration.std()
-    return {"acceleration": acceleration + noise * rng.standard_normal(count), "force": force[:2 * inner * count:2 * inner], "fs": np.array(fs)}
+    return {"acceleration": acceleration + noise * rng.standard_normal(count), "force": force[:2 * inner * count:2 * inner],
+            "fs": np.array(fs)}
