@@ -73,10 +73,10 @@ def test_samples_of_a_batch_do_not_touch_each_other(term: Term) -> None:
 
 @memories
 def test_a_trial_leaves_no_trace(term: Term) -> None:
-    q, v = ringing(300, 1 / 2000)
+    q, v = ringing(100, 1 / 2000)
     p = batch_of(term, 2)
     state = start_state(term, p)
-    for i in range(300):
+    for i in range(100):
         before = {f.name: getattr(state, f.name).copy() for f in fields(State)}
         first = trial(term, state, np.full(2, q[i]), np.full(2, v[i]), 1 / 2000, p)
         trial(term, state, np.full(2, -2 * q[i]), np.full(2, -v[i]), 1 / 2000, p)  # a wild iterate: reverses and closes loops

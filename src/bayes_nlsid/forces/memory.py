@@ -14,6 +14,7 @@ from bayes_nlsid.forces.laws import Value, where
 
 SLIDERS = 160  # finite sliders that stand for the distribution on (0, phi_max); one more carries the jump at phi_max
 SUBSTEPS = 2  # steps of a Bouc–Wen loop on each monotone piece
+NEAR, FAR = 0.1127016653792583, 0.8872983346207417  # outer nodes of three-point Gauss quadrature on (0, 1)
 CEILING = 1e50  # N; only a loop whose parameters give it no bound gets there
 
 
@@ -142,29 +143,33 @@ def bouc_wen_step(z: Value, move: Value, alpha: Value, beta: Value, gamma: Value
     are exact at any step length, and for any nu they stay stable however fast the loop saturates. Where z passes through zero the
     right-hand side has a kink; the length up to the crossing is then taken from a quadrature of dq/dz and the step begins anew at
     z = 0, so that the order is kept. With 64 pieces per half-cycle of a well-rounded loop the largest error is 1e-6 (nu = 2) to
-    1e-5 (nu = 1.5) of the largest force; with 16 it is 5e-5 to 1e-4.
+    1e-5 (nu = 1.5) of the largest force; with 16 it is 5e-5 to 2e-4.
     """
     direction = where(move < 0.0, -1.0, 1.0)
     step = np.abs(move) / SUBSTEPS
     power = np.maximum(nu, 1.0)
     # In y = d z, with d q growing: dy/dx = alpha − bend |y|^nu, where bend changes only with the sign of y.
     y = direction * z
+    above, below = beta * (gamma + delta), beta * (delta - gamma)
+    # Fixed point (alpha/bend)^(1/nu) for y ≥ 0, if the loop has one.
+    bounded = (above > 0.0) & (alpha > 0.0)
+    fixed = where(bounded, where(bounded, alpha / where(bounded, above, 1.0), 1.0) ** (1.0 / power), 1.0)
     for _ in range(SUBSTEPS):
-        size, below = np.abs(y), beta * (delta - gamma)
+        size = np.abs(y)
+        steep = size ** (power - 1.0)
         # Three-point Gauss quadrature of dx = dy / (alpha − below |y|^nu) from y up to zero; no crossing if that is not positive.
-        one = alpha - below * (0.1127016653792583 * size) ** power
-        two = alpha - below * (0.5 * size) ** power
-        three = alpha - below * (0.8872983346207417 * size) ** power
+        bent = below * size * steep
+        one, two, three = alpha - bent * NEAR ** power, alpha - bent * 0.5 ** power, alpha - bent * FAR ** power
         rises = (one > 0.0) & (two > 0.0) & (three > 0.0)
         one, two, three = where(rises, one, 1.0), where(rises, two, 1.0), where(rises, three, 1.0)
         to_zero = size * (5.0 / one + 8.0 / two + 5.0 / three) / 18.0
         crosses = (y < 0.0) & rises & (to_zero < step)
         length, begin = where(crosses, step - to_zero, step), where(crosses, 0.0, y)
-        bend = where(begin < 0.0, below, beta * (gamma + delta))
-        side, size = where(begin < 0.0, -1.0, 1.0), np.abs(begin)
+        positive = begin >= 0.0
         # f = alpha − bend |y|^nu and its derivative J; x is J times the step, held where exp is finite.
-        steep = bend * size ** (power - 1.0)
-        f, jacobian = alpha - steep * size, -power * steep * side
+        bend = where(positive, above, below)
+        steep = bend * where(crosses, where(power == 1.0, 1.0, 0.0), steep)
+        f, jacobian = alpha - steep * np.abs(begin), power * steep * where(positive, -1.0, 1.0)
         x = np.minimum(np.maximum(jacobian * length, -700.0), 200.0)
         small = np.abs(x) < 0.02
         safe = where(small, 1.0, x)
@@ -176,9 +181,8 @@ def bouc_wen_step(z: Value, move: Value, alpha: Value, beta: Value, gamma: Value
         curvature = alpha - bend * np.abs(stage) ** power - f - jacobian * (stage - begin)
         end = stage + 2.0 * length * phi3 * curvature
         # f is concave in y ≥ 0, so the exact solution lies between that of the tangent (stage) and that of the chord from here to
-        # the fixed point (alpha/bend)^(1/nu); these bounds take over where the loop saturates within one step.
-        settles = (bend > 0.0) & (alpha > 0.0) & (begin >= 0.0)
-        fixed = where(settles, where(settles, alpha / where(settles, bend, 1.0), 1.0) ** (1.0 / power), 1.0)
+        # the fixed point; these bounds take over where the loop saturates within one step.
+        settles = bounded & positive
         gap = fixed - begin
         rate = where(settles & (np.abs(gap) > 1e-14 * fixed), f / where(gap == 0.0, 1.0, gap), 0.0)
         chord = fixed - gap * np.exp(-np.minimum(np.maximum(rate, 0.0) * length, 700.0))

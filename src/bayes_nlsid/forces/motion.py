@@ -209,8 +209,8 @@ def force_along(term: Term, motion: Motion, p: ArrayLike, excess: bool = False) 
     batch = np.ascontiguousarray(values.reshape(-1, len(term.params)))
     force = np.empty((len(batch), motion.n))
     along = {"none": _static, "masing": _masing, "sliders": _marched, "bouc_wen": _marched}[term.memory]
-    points = motion.n if term.memory == "none" else len(motion.path.nodes)
-    rows = max(1, BLOCK // points)
+    # Marching goes sample by sample with the whole batch side by side.
+    rows = max(1, BLOCK // motion.n) if along is not _marched else max(1, len(batch))
     with np.errstate(over="ignore", invalid="ignore"):
         for first in range(0, len(batch), rows):
             part = batch[first:first + rows]
