@@ -165,3 +165,22 @@ def test_bad_settings_are_refused() -> None:
         identify_modes(recording, model, window=(1.0, 9.0))
     with pytest.raises(ValueError, match="span"):
         identify_modes(recording, model, span=0.5)
+
+
+def test_a_dead_channel_does_no_harm() -> None:
+    model = truth([40.0, 97.0], [0.004, 0.003])
+    recording = decay(model, [1e-3, 1e-4], 6.0, 1e-2, 4)
+    response = recording.response.copy()
+    response[:, 2] = 0.0
+    found = identify_modes(Recording("decay", recording.dt, response, recording.channels, recording.force), model)
+    np.testing.assert_allclose(found.frequency, model.frequency, rtol=1e-3)
+    assert (found.shapes[2] == 0).all()
+
+
+def test_pure_noise_and_very_short_recordings_hold_no_modes() -> None:
+    model = truth([40.0, 97.0], [0.004, 0.003])
+    rng = np.random.default_rng(7)
+    for n in (60, 6000):
+        noise = Recording("noise", 1 / FS, rng.standard_normal((n, 3)), channels(), np.zeros((n, 0)))
+        found = identify_modes(noise, model)
+        assert found.modes == 0 and found.shapes.shape == (3, 0) and len(found.notes) >= 2

@@ -64,7 +64,8 @@ def test_locations_from_table_toml_and_archive_agree(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("changes, word", [
     ({"K": np.eye(2)}, "shape"), ({"K": CHAIN.K + np.triu(np.ones((3, 3)), 1)}, "not symmetric"), ({"M": np.diag([1.0, 0, 1])}, "definite"),
-    ({"K": -CHAIN.K}, "negative eigenvalues"), ({"M": np.full((3, 3), np.nan)}, "NaN"), ({"K": None}, "K missing"), ({"M": np.ones(3)}, "shape"),
+    ({"K": -CHAIN.K}, "negative eigenvalues"), ({"M": np.full((3, 3), np.nan)}, "NaN"), ({"K": None}, "K missing"),
+    ({"M": np.ones(3)}, "shape"),
     ({"location_vectors": np.ones((2, 4))}, "entries"), ({"location_vectors": np.ones((1, 3))}, "rows"),
     ({"K_part_names": np.array(["a", "b"])}, "names"), ({"base_vector": np.ones(2)}, "base_vector")])
 def test_damaged_archives_are_refused(tmp_path: Path, changes: dict[str, object], word: str) -> None:
@@ -73,8 +74,9 @@ def test_damaged_archives_are_refused(tmp_path: Path, changes: dict[str, object]
     assert "nominal.npz" in caught.value.where and caught.value.mend
 
 
-@pytest.mark.parametrize("text, word", [("name,dof,coefficient\nA,7,1\n", "does not exist"), ("name,dof,coefficient\nA,1,much\n", "not a number"),
-                                        ("name,dof\nA,1\n", "missing"), ("name,dof,coefficient,role\nA,1,1,boss\n", "unknown role")])
+@pytest.mark.parametrize("text, word", [
+    ("name,dof,coefficient\nA,7,1\n", "does not exist"), ("name,dof,coefficient\nA,1,much\n", "not a number"),
+    ("name,dof\nA,1\n", "missing"), ("name,dof,coefficient,role\nA,1,1,boss\n", "unknown role")])
 def test_damaged_tables_are_refused_with_their_line(tmp_path: Path, text: str, word: str) -> None:
     M, K = market(tmp_path / "m.mtx", CHAIN.M), market(tmp_path / "k.mtx", CHAIN.K)
     (tmp_path / "l.csv").write_text(text)

@@ -77,8 +77,8 @@ def test_a_free_beam_with_published_shapes_of_three_sensors() -> None:
     model = modal_model(lapped_beam(LappedBeam(0.72, 0.0254, 0.0127, 2e11, 7732, sensors=places)), 3)
     shapes = np.array([[1.0, 1.0, 1.0], [-0.044, -0.74, 0.90], [-0.636, 0.306, 0.055]])
     names, small = tuple(n for n, _ in places), np.full(3, 1e-3)
-    modes = IdentifiedModes(np.array([80.3, 298.0, 583.0]), small, shapes, names, names, (0, 1, 2), small, small, np.full((3, 3), 0.01), small,
-                            small, ((0.0, 1.0),) * 3, ("ok",) * 3)
+    modes = IdentifiedModes(np.array([80.3, 298.0, 583.0]), small, shapes, names, names, (0, 1, 2), small, small, np.full((3, 3), 0.01),
+                            small, small, ((0.0, 1.0),) * 3, ("ok",) * 3)
     found = polarity(modes, model)
     assert [f.channel for f in found] == ["acc1"] and found[0].confidence > 0.99
     mended = IdentifiedModes(modes.frequency, small, shapes * np.array([[-1.0], [1.0], [1.0]]), names, names, (0, 1, 2), small, small,

@@ -272,7 +272,7 @@ def _one(recording: Recording, fit: PoleFit, i: int, k: int, window: tuple[float
     to_displacement = pole ** -np.array([float(ORDER[c.quantity]) for c in recording.channels])
     shape = fit.residues[i] * to_displacement
     sd = fit.residues_sd[i] * np.abs(to_displacement)
-    weight = 1 / np.maximum(sd, np.finfo(float).tiny) ** 2
+    weight = np.maximum(sd / np.abs(shape).max(), 1e-9) ** -2.0  # a dead channel has neither signal nor noise
     turn = np.exp(-0.5j * np.angle(np.sum(weight * shape**2)))
     if not recording.free and (turn * -1j).real < 0:  # residue of φ_c φ_f / (2 i ω): the force fixes the sign
         turn = -turn

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 LARGEST_CONDITION = 100.0
 """Condition number of the sensor rows beyond which modes cannot be told apart in practice."""
+LEAK = 1e-3
+"""Gain of a mode's filter at another mode's frequency from which that mode counts as present in the band."""
 Bands = Sequence[tuple[float, float]]
 
 
@@ -41,8 +43,9 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
     fs : float, optional
         Lower sampling rate, Hz.
     bands : sequence of (float, float), optional
-        One band per mode, Hz. Each mode is then filtered in its own band and told apart only from the modes whose bands overlap it,
-        so that few sensors can feed many well separated modes; what a mode does outside its band is lost.
+        One band per mode, Hz. Each mode is then filtered in its own band and told apart only from modes whose bands overlap it or which
+        resonate in the skirts of its filter (half the lower to 1.25 times the upper edge), so that few sensors can feed many well
+        separated modes; what a mode does outside its band is lost.
     static_correction : bool
         Take the measured force's quasi-static response of the modes left out (``model.residual``) from the measurement and add it to
         the joints. Good only if the residual flexibility is that of the structure, not merely of a reduced model of it.
@@ -67,11 +70,12 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
     rows = model.rows([c.location for c in recording.channels])
     psd = noise if noise is not None else _estimated_noise(recording)
     whole = list(range(len(chosen)))
-    plan = [(whole, whole, band)] if bands is None else [([i], _overlapping(bands, i), bands[i]) for i in whole]
+    plan = [(whole, band)] if bands is None else [([i], bands[i]) for i in whole]
     columns: list[dict[str, NDArray[np.float64]]] = [{} for _ in whole]
     valid, conditions, dt = slice(0, recording.n), [], 0.0
-    for own, members, limits in plan:
+    for own, limits in plan:
         motion = kinematics(recording, limits, fs)
+        members = whole if bands is None else _heard(motion, model.frequency[list(chosen)], bands, own[0])
         x = _motions(recording, model, motion, limits, fs, static_correction)
         level = acceleration_noise(psd, motion)
         picked = [chosen[i] for i in members]
@@ -146,9 +150,10 @@ def acceleration_noise(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.floa
     return np.asarray(np.mean(noise.psd[inside] * omega[:, None] ** power, axis=0), dtype=float)
 
 
-def _overlapping(bands: Bands, i: int) -> list[int]:
-    """Indices of modes whose band overlaps band i, itself included."""
-    return [k for k, other in enumerate(bands) if other[0] < bands[i][1] and bands[i][0] < other[1]]
+def _heard(motion: Kinematics, frequency: NDArray[np.float64], bands: Bands, i: int) -> list[int]:
+    """Modes to be solved for together in band i: those whose bands overlap it, and those that resonate in the skirts of its filter."""
+    low, high = bands[i]
+    return [k for k, other in enumerate(bands) if k == i or (other[0] < high and low < other[1]) or motion.gain(frequency[k]) > LEAK]
 
 
 def _motions(recording: Recording, model: ModalModel, motion: Kinematics, band: tuple[float, float], fs: float | None,
