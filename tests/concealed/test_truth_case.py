@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import studies.concealed
 from studies.concealed.generate import generate
+from studies.concealed.truth import catalogue
 from studies.concealed.truth.campaign import FS, PERIODS
 from studies.concealed.truth.case import Order, make, plan
+from studies.concealed.truth.effects import _tap, draw_effect, truth_of
 from studies.concealed.truth.folder import write
 from studies.concealed.truth.sheet import answer
 
@@ -92,6 +94,33 @@ def test_tuned_local_effect_reaches_its_target_in_the_recorded_response():
     assert not sheet["inside_tolerances"] and sheet["chi2_not_lti"] > 100
     name = made.effects[0].loc
     assert sheet["equivalent_locations"][name]["similarity"][name] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("cls", [c for c in catalogue.INPUT + catalogue.SENSOR + catalogue.AMBIENT])
+@pytest.mark.parametrize("target", [0.3, 0.01])
+def test_channel_effects_reach_their_targets(made, cls, target):
+    effect = draw_effect(cls, target, made.bench, np.random.default_rng(1), None, (), ())
+    assert effect.achieved == pytest.approx(target, rel=0.05)
+    force, accel = (a[made.bench.force.size :] for a in truth_of(made.bench, (effect,)).clean(made.campaign, high(made)))
+    force0, accel0 = (a[made.bench.force.size :] for a in made.baseline["high_1"])
+    if effect.loc == "FORCE":
+        assert np.array_equal(accel, accel0) and np.std(force - force0) > 0.3 * target * np.std(force0)
+    else:
+        channel = slice(None) if effect.taps[0].channel < 0 else slice(effect.taps[0].channel, effect.taps[0].channel + 1)
+        size = np.sqrt(np.mean((accel - accel0)[:, channel] ** 2) / np.mean(accel0[:, channel] ** 2))
+        # Another multisine realisation and another draw of the slow signals: the same size, not the same figure.
+        assert 0.4 * target < size < 2.5 * target
+
+
+@pytest.mark.parametrize("target", [0.3, 0.03, 0.01])
+def test_dropouts_and_crosstalk_reach_their_targets(made, target):
+    for seed in range(6):
+        for kind in ("dropouts", "crosstalk", "cell_curvature"):
+            assert _tap("other", kind, target, made.bench, np.random.default_rng(seed), ()).achieved == pytest.approx(target, rel=0.1)
+
+
+def high(made):
+    return next(e for e in made.campaign.entries if e.name == "high_1")
 
 
 def test_noise_is_what_the_answer_says_and_periods_differ_by_it_only(made):

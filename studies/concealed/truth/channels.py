@@ -76,7 +76,7 @@ def apply(
         source = force if tap.params["source"] < 0 else accel[:, tap.params["source"]]
         accel[:, i] += a * source
     elif tap.formula == "dropouts":
-        accel[:, i] *= _gate(rng, n, fs, a, tap.params["length"])
+        accel[:, i] *= 1.0 - min(a, 1.0) * _losses(rng, n, fs, tap.params["rate"], tap.params["length"])
     elif tap.formula == "cell_curvature":
         x = force / tap.params["rms"]
         return accel, force + a * tap.params["rms"] * (x * x - 1.0) / (1.0 + 0.1 * x * x)
@@ -106,9 +106,9 @@ def base_reply(tap: Tap, n: int, fs: float, rng: np.random.Generator, plant: Pla
     return (relative + floor[:, None])[lead:]
 
 
-def _gate(rng: np.random.Generator, n: int, fs: float, per_second: float, length: float) -> np.ndarray:
-    """One, with short losses of contact (``length`` s, ``per_second`` on average)."""
-    gate = np.ones(n)
+def _losses(rng: np.random.Generator, n: int, fs: float, per_second: float, length: float) -> np.ndarray:
+    """Zero, and one during short losses of contact (``length`` s, ``per_second`` on average)."""
+    lost = np.zeros(n)
     for at in np.nonzero(rng.random(n) < per_second / fs)[0]:
-        gate[at : at + max(1, int(length * fs * rng.uniform(0.5, 1.5)))] = 0.0
-    return gate
+        lost[at : at + max(1, int(length * fs * rng.uniform(0.5, 1.5)))] = 1.0
+    return lost

@@ -301,7 +301,7 @@ def _tap(cls: str, kind: str, target: float, bench: Bench, rng: np.random.Genera
     else:
         loc = f"S{channel + 1}"
     own = float(np.std(bench.accel[:, channel])) if channel >= 0 else bench.rms
-    tap = _draw_tap(cls, kind, bench, rng, channel, own)
+    tap = _draw_tap(cls, kind, target, bench, rng, channel, own)
     if tap.channel == -2:
         loc = "BASE" if cls == "base_motion" else "ALL_SENSORS"
         own = bench.rms
@@ -315,7 +315,7 @@ def _tap(cls: str, kind: str, target: float, bench: Bench, rng: np.random.Genera
     return Effect(cls, loc, target, achieved, tap.formula, params, (), (tap,))
 
 
-def _draw_tap(cls: str, kind: str, bench: Bench, rng: np.random.Generator, channel: int, own: float) -> Tap:
+def _draw_tap(cls: str, kind: str, target: float, bench: Bench, rng: np.random.Generator, channel: int, own: float) -> Tap:
     sign = float(rng.choice([-1.0, 1.0]))
     if cls in ("force_gain", "sensor_gain"):
         return Tap(str(rng.choice(["gain", "tilted_gain"])), channel, sign * 0.1, {"tilt": float(rng.uniform(-0.3, 0.3))})
@@ -361,7 +361,9 @@ def _draw_tap(cls: str, kind: str, bench: Bench, rng: np.random.Generator, chann
         source = int(rng.choice([i for i in range(-1, bench.sensors) if i != channel]))
         return Tap("crosstalk", channel, sign * 0.1, {"source": source})
     if kind == "dropouts":
-        return Tap("dropouts", channel, 2.0, {"length": float(rng.uniform(0.002, 0.01))})
+        length = float(rng.uniform(0.002, 0.01))
+        # Enough of the time is touched for the target to be reached with part of the signal lost.
+        return Tap("dropouts", channel, 0.7, {"length": length, "rate": float(np.clip(2.0 * target**2, 0.02, 0.3)) / length})
     return Tap("cell_curvature", -1, sign * 0.1, {"rms": float(np.std(bench.force))})
 
 
@@ -397,6 +399,7 @@ def _tune_tap(tap: Tap, target: float, bench: Bench, own: float) -> float:
         value = max(_tap_strength(replace(tap, amount=amount), bench, own), 1e-12)
         if abs(np.log(value / target)) < 0.005:
             break
-        power = 2.0 if tap.formula == "dropouts" else 1.0
-        amount = float(amount * np.clip((target / value) ** power, 0.02, 50.0))
+        amount = float(amount * np.clip(target / value, 0.02, 50.0))
+        if tap.formula == "dropouts":
+            amount = min(amount, 1.0)
     return amount
