@@ -22,7 +22,7 @@ UNKNOWN_DAMPING = 1e-3
 
 
 def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
-                zeta: float | Sequence[float] | NDArray[np.float64] | IdentifiedModes = UNKNOWN_DAMPING, measured_frequencies: bool = False,
+                zeta: float | Sequence[float] | NDArray[np.float64] | IdentifiedModes | None = None, measured_frequencies: bool = False,
                 residual: bool = True) -> ModalModel:
     """Elastic modes with the rows of every named location.
 
@@ -33,7 +33,8 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
     modes : int or sequence of int
         The lowest so many elastic modes, or 0-based indices of elastic modes.
     zeta : float, sequence (m,) or IdentifiedModes
-        Damping ratios. Identified modes give theirs, with standard deviation, to the model modes they belong to; the others get 0.1 %.
+        Damping ratios; by default those of the damping matrix C (its diagonal in modal coordinates) if there is one, else 0.1 %. Identified
+        modes give theirs, with standard deviation, to the model modes they belong to; the others get 0.1 %.
     measured_frequencies : bool
         Take the frequencies of identified modes too, in place of the computed ones.
     residual : bool
@@ -71,6 +72,11 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
                        inputs=structure.inputs, joints=structure.joints, residual=G, notes=notes)
     if structure.joints and residual:
         model = _with_note(model, _lost_at_joints(structure, model))
+    if zeta is None:
+        zeta = UNKNOWN_DAMPING
+        if structure.C is not None:
+            phi = found.shapes[:, index]
+            zeta = np.einsum("ij,ij->j", phi, structure.C @ phi) / (2 * found.omega[index])
     return with_damping(model, zeta, measured_frequencies)
 
 
