@@ -7,6 +7,7 @@ Set the environment variable BAYES_NLSID_COMPILED=0 to force the plain path.
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from bayes_nlsid.forces.memory import bouc_wen_step, iwan_sliders, slider_step
 
 
 def compiled_wanted() -> bool:
-    """Whether the environment leaves compiled loops on (they are, unless BAYES_NLSID_COMPILED is 0)."""
-    return os.environ.get("BAYES_NLSID_COMPILED", "1") != "0"
+    """Whether to run compiled loops: numba is installed, and BAYES_NLSID_COMPILED is not 0."""
+    return os.environ.get("BAYES_NLSID_COMPILED", "1") != "0" and find_spec("numba") is not None
 
 
 def march(kind: str, nodes: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
