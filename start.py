@@ -128,7 +128,7 @@ def main(arguments):
     """`run` and `test`; anything after the word is handed on to nlsid or pytest."""
     if sys.version_info < OLDEST:
         needed = ".".join(str(number) for number in OLDEST)
-        stop(f"Python {needed} or newer is needed, this is {sys.version.split()[0]}; run this file with a newer one, for instance python3.12.")
+        stop(f"Python {needed} or newer is needed, this is {sys.version.split()[0]}; use for instance python3.12.")
     word, rest = (arguments[0] if arguments else "--help"), list(arguments[1:])
     if word == "run":
         set_up([RUN_LOCK])

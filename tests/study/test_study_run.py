@@ -1,0 +1,215 @@
+"""A run skips what is unchanged, survives a kill anywhere, and says the same every time."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.study.progress import Reporter, duration
+from bayes_nlsid.study.reading import read_study
+from bayes_nlsid.study.run import rebuild_report, run_study
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+
+
+@pytest.fixture(scope="module")
+def finished(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished") / "out"
+    run_study(read_study(small), out)
+    return out
+
+
+def timeless(out: Path) -> dict[str, Any]:
+    """What must be the same however often a run was interrupted."""
+    result = json.loads((out / "result.json").read_text())
+    for stage in result["stages"].values():
+        stage.pop("seconds")
+    return result
+
+
+def log_of(out: Path) -> str:
+    return (out / "run.log").read_text(encoding="utf-8")
+
+
+def test_finds_what_made_the_recording(finished: Path) -> None:
+    """Truth: 20.3 Hz, 1.2 % and 4e8 N/m³ (see the template); noise 0.2 %."""
+    result = timeless(finished)
+    values = {p["name"]: p["fit"] for p in result["parameters"]}
+    assert result["status"] == "ok" and result["selection"]["terms"] == [{"index": 2, "name": "cubic", "locations": ["x"]}]
+    assert values["f[1]"] == pytest.approx(20.3, rel=5e-3)
+    assert values["cubic[x].c"] == pytest.approx(4e8, rel=0.1)
+
+
+def test_contract_files(finished: Path) -> None:
+    assert {"result.json", "report.html", "run.log", "figures", "stages"} <= {p.name for p in finished.iterdir()}
+    result = timeless(finished)
+    assert result["format"] == 1 and set(result["versions"]) >= {"bayes_nlsid", "numpy"}
+    assert set(result["inputs"]) == {"small.toml", "recording.npz"} and all(len(h) == 64 for h in result["inputs"].values())
+    assert result["selection"]["forward"] == [2] and {"mse", "mse_linear"} <= result["selection"]["score"].keys()
+    assert len(list((finished / "figures").glob("*.png"))) >= 2
+
+
+def test_second_run_computes_nothing(small: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    (out / "run.log").unlink()
+    run_study(read_study(small), out)
+    assert log_of(out).count("taken from an earlier run") == 3
+    assert timeless(out) == timeless(finished)
+
+
+@pytest.mark.parametrize(("right", "wrong", "reused"), [
+    ('title = "My first', 'title = "My second', 3),            # words change the report only
+    ("starts = 20", "starts = 3", 2),
+    ("zeta = 0.011", "zeta = 0.012", 1),
+    ("window = [0.0, 4.0]", "window = [0.0, 3.0]", 0),
+])
+def test_only_what_depends_on_a_change_is_redone(right: str, wrong: str, reused: int, small: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    (out / "run.log").unlink()
+    text = small.read_text(encoding="utf-8")
+    assert right in text
+    changed = small.with_name(f"changed-{tmp_path.name}.toml")
+    changed.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+    run_study(read_study(changed), out)
+    assert log_of(out).count("taken from an earlier run") == reused, log_of(out)
+
+
+def test_another_seed_redoes_what_draws(small: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    (out / "run.log").unlink()
+    assert run_study(read_study(small), out, seed=7)["seed"] == 7
+    assert log_of(out).count("taken from an earlier run") == 2
+
+
+KILLER = """
+import os, sys
+from pathlib import Path
+from bayes_nlsid.study import run
+from bayes_nlsid.study.reading import read_study
+stage = sys.argv[3]
+real = run._stage
+def fatal(name):
+    def stage_function(context):
+        found = real(name)(context)
+        if name == stage:
+            os.kill(os.getpid(), 9)
+        return found
+    return stage_function
+run._stage = fatal
+if stage == "report":
+    run.render = lambda report: os.kill(os.getpid(), 9)
+run.run_study(read_study(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("stage", ["read", "linear", "identify", "report"])
+def test_kill_and_resume_gives_the_same_numbers(stage: str, small: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    killed = subprocess.run([sys.executable, "-c", KILLER, str(small), str(out), stage], env=ENVIRONMENT, check=False)
+    assert killed.returncode == -9
+    run_study(read_study(small), out)
+    assert timeless(out) == timeless(finished)
+    assert not list((out / "stages").glob(".*"))
+    for name in ("read", "linear", "identify"):
+        with np.load(out / "stages" / name / "arrays.npz") as a, np.load(finished / "stages" / name / "arrays.npz") as b:
+            assert set(a.files) == set(b.files)
+            for key in a.files:
+                np.testing.assert_array_equal(a[key], b[key])
+
+
+def test_interrupt_keeps_finished_stages(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from bayes_nlsid.study import run
+
+    real = run._stage
+
+    def stopped(name: str) -> Any:
+        def press(context: Any) -> Any:
+            raise KeyboardInterrupt
+        return press if name == "identify" else real(name)
+
+    monkeypatch.setattr(run, "_stage", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(read_study(small), tmp_path / "out")
+    assert not (tmp_path / "out" / "stages" / "lock").exists()
+    monkeypatch.undo()
+    run_study(read_study(small), tmp_path / "out")
+    assert log_of(tmp_path / "out").count("taken from an earlier run") == 2
+
+
+def test_report_is_rebuilt_without_the_study_file(small: Path, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    page = (out / "report.html").read_bytes()
+    (out / "report.html").unlink()
+    rebuild_report(out)
+    assert (out / "report.html").read_bytes() == page
+
+
+def test_report_of_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no results"):
+        rebuild_report(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        rebuild_report(tmp_path / "nowhere")
+
+
+def test_report_page_stands_alone(finished: Path) -> None:
+    from html.parser import HTMLParser
+
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    opened: list[str] = []
+
+    class Walker(HTMLParser):
+        def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+            values = dict(attributes)
+            for name in ("src", "href"):
+                assert (values.get(name) or "#").startswith(("#", "data:")), values
+            assert tag not in ("script", "link", "iframe")
+            if tag not in ("meta", "img", "br"):
+                opened.append(tag)
+
+        def handle_endtag(self, tag: str) -> None:
+            assert opened.pop() == tag
+
+    Walker().feed(page.replace("<!doctype html>", ""))
+    assert not opened
+    for words in ("cubic at x", "prefers-color-scheme: dark", "@media print", "SHA-256", "stages/identify", "Next:", "width=device-width"):
+        assert words in page, words
+
+
+def test_report_escapes_what_users_write(small: Path, tmp_path: Path) -> None:
+    text = small.read_text(encoding="utf-8").replace('title = "My first study', 'title = "<script>alert(1)</script> A & B')
+    changed = small.with_name("escaped.toml")
+    changed.write_text(text[:text.index("[identification]")], encoding="utf-8")
+    run_study(read_study(changed), tmp_path)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>" not in page and "&lt;script&gt;alert(1)&lt;/script&gt; A &amp; B" in page
+
+
+def test_progress_line_and_log(tmp_path: Path) -> None:
+    from io import StringIO
+
+    terminal = StringIO()
+    told = Reporter((tmp_path / "a.log", tmp_path / "b.log"), terminal)
+    told.begin(1, 2, "read", "not computed yet")
+    told.update(1.0, "hammer")
+    told.end(75.0, reused=False)
+    assert "[1/2] read 100 %" in terminal.getvalue() and "done in 1 min 15 s" in terminal.getvalue()
+    assert (tmp_path / "a.log").read_text() == (tmp_path / "b.log").read_text() and "not computed yet" in (tmp_path / "a.log").read_text()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (12.4, "12 s"), (75, "1 min 15 s"), (7200, "2 h 0 min")])
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -1,0 +1,116 @@
+"""The command line: exit statuses, one sentence for each mistake, quick help."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bayes_nlsid.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("run", "check", "diagnose", "compare", "montecarlo", "frf", "report", "terms", "hypotheses", "new")
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert all(f"\n    {name}" in text for name in COMMANDS), text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_the_common_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    text = capsys.readouterr().out
+    assert all(option in text for option in ("--seed", "--workers", "--executor", "--quiet", "--log"))
+
+
+def test_help_is_quick() -> None:
+    """Best of three, so that a busy machine does not decide."""
+    spent = []
+    for _ in range(3):
+        began = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "bayes_nlsid", "--help"], env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+                       capture_output=True, check=True)
+        spent.append(time.perf_counter() - began)
+    assert min(spent) < 0.5, spent
+
+
+@pytest.mark.parametrize(("arguments", "status", "words"), [
+    (["run", "nowhere.toml", "--out", "x"], 2, "there is no such file"),
+    (["check", "nowhere.toml"], 2, "there is no such file"),
+    (["report", "nowhere"], 2, "there is no such folder"),
+    (["compare", "s.toml", "--out", "x"], 2, "not part of version"),
+    (["montecarlo", "s.toml", "--out", "x"], 2, "not part of version"),
+    (["frf", "s.toml", "--out", "x"], 2, "not part of version"),
+])
+def test_refusals(arguments: list[str], status: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                  capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == status
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and words in said.err and said.err.startswith("nlsid")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["run"], ["run", "s.toml"], ["flurb"], ["terms", "--seed", "-1"], ["terms", "--workers", "0"],
+                                       ["terms", "--executor", "cloud"], ["terms", "--executor", "dask://a:1"], ["--nonsense"]])
+def test_wrong_usage_is_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2 and "Traceback" not in capsys.readouterr().err
+
+
+def test_new_then_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "mine"
+    assert main(["new", str(folder)]) == 0
+    assert main(["check", str(folder / "study.toml")]) == 0
+    text = capsys.readouterr().out
+    assert "stages: read -> linear -> identify -> posterior -> predict -> report" in text
+    assert main(["new", str(folder)]) == 2, "an existing study is never overwritten"
+    assert "already there" in capsys.readouterr().err
+
+
+def test_terms_show_table_1(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["terms"]) == 0
+    first = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line.split()]
+    assert [int(word) for word in first if word.isdigit()] == list(range(1, 47))
+
+
+def test_ctrl_c_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    import bayes_nlsid.study.screen as screen
+
+    def pressed() -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(screen, "terms_table", pressed)
+    assert main(["terms"]) == 130
+    assert "run the same command again" in capsys.readouterr().err
+
+
+def test_nothing_but_the_summary_without_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from bayes_nlsid.study.template import TEXT, write_template
+
+    study = write_template(tmp_path / "s")
+    study.write_text(TEXT[:TEXT.index("[identification]")], encoding="utf-8")
+    assert main(["run", str(study), "--out", str(tmp_path / "out"), "--log", str(tmp_path / "more.log")]) == 0
+    said = capsys.readouterr()
+    assert said.err == "" and "report.html" in said.out
+    assert "[1/3] read" in (tmp_path / "more.log").read_text()
+    assert main(["run", str(study), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main(["run", str(study), "--out", str(tmp_path / "out"), "--log", str(tmp_path / "no" / "x.log")]) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX pipes")
+def test_closed_pipe_is_quiet() -> None:
+    done = subprocess.run([f"{sys.executable} -m bayes_nlsid terms | head -1"], shell=True, capture_output=True, text=True, check=False,
+                          env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+    assert done.stderr == "" and done.stdout.startswith("number")
