@@ -118,6 +118,7 @@ class LinearKind:
     natural: Callable[[Array], Array]
     attach: Callable[[Array, Complex], Attachment] | None = None
     chain: Callable[[Array, Complex, int], Chain] | None = None
+    other: int = -1
 
 
 def linear_kind(fam: Family, cls: str, place: str, channel: int, mass: float, frequency: float = 0.0, kind: str = "",
@@ -157,7 +158,7 @@ def linear_kind(fam: Family, cls: str, place: str, channel: int, mass: float, fr
             mix = np.eye(count)
             mix[other, channel] = GAIN * x[0]
             return Chain(np.ones((len(s), count), dtype=complex), mix)
-        return LinearKind(np.array([start]), 2 * one, 0 * one, ("leak",), ("",), lambda x: GAIN * x, chain=leak)
+        return LinearKind(np.array([start]), 2 * one, 0 * one, ("leak",), ("",), lambda x: GAIN * x, chain=leak, other=other)
     gain, everywhere = cls.endswith("gain"), cls.startswith("force")
     def factor(x: Array, s: Complex, count: int) -> Chain:
         sign = -1.0 if everywhere else 1.0

@@ -19,8 +19,26 @@ from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-LawAlong = Callable[[Array, Array, float], Array]
 Attached = Callable[[Complex], tuple[Attachment, ...]] | None
+
+
+@final
+@dataclass(frozen=True)
+class LawAlong:
+    """A law as the solver sees it.
+
+    Parameters
+    ----------
+    force : callable
+        ``force(d, v, dt) -> (n,)`` along one period or burst, memory honoured inside.
+    slope : callable or None
+        ``slope(d, v) -> (dg/dd, dg/dv)``, if the force depends on the present motion only.
+    """
+
+    force: Callable[[Array, Array, float], Array]
+    slope: Callable[[Array, Array], tuple[Array, Array]] | None = None
+
+
 FINER = 2  # samples of the simulation per sample of the recording
 
 
@@ -94,12 +112,12 @@ def bed(modes: Modes, spectra: Spectra, rows: Array, shaker: Array, attach: Atta
 
 
 def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None = None, most: int = 40,
-           tolerance: float = 1e-5, depth: int = 8) -> tuple[Complex, Complex, str]:
+           tolerance: float = 1e-5) -> tuple[Complex, Complex, str]:
     """Motion and force at every place in one record.
 
     Parameters
     ----------
-    laws : one callable per place, ``law(d, v, dt) -> force`` along one period (or burst), memory honoured inside.
+    laws : one per place.
     start : (K, J) first guess.
 
     Returns
@@ -107,41 +125,117 @@ def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
     D, G : (K, J) spectra of motion and force
     status : ``"ok"`` or ``"not converged"``
     """
+    if all(law.slope is not None for law in laws):
+        return _newton(paths, record, laws, start, max(most // 3, 4), tolerance)
+    return _relax(paths, record, laws, start, most, tolerance)
+
+
+def _rest(paths: Bed, linear: Complex, D: Complex, laws: tuple[LawAlong, ...]) -> tuple[Complex, Complex, Array, Array, Array]:
+    """Residual of the fixed point, force spectrum, and motion and force in time."""
+    d, v = paths.in_time(D)
+    g = np.stack([law.force(d[:, j], v[:, j], paths.dt) for j, law in enumerate(laws)], axis=1)
+    G = paths.to_lines(g)
+    return linear - _mul(paths.among, G) - D, G, d, v, g
+
+
+def _mul(matrix: Complex, vector: Complex) -> Complex:
+    return np.asarray(matrix[:, :, 0] * vector if vector.shape[1] == 1 else (matrix @ vector[:, :, None])[:, :, 0])
+
+
+def _preconditioner(paths: Bed, d: Array, v: Array, g: Array) -> Complex:
+    """(K, J, J): (1 + R z)⁻¹ with the best linear stiffness and damping z of each law along its motion."""
+    equivalent = _equivalent(d, v, g)
+    dynamic = equivalent[:, 0] + paths.s[:, None] * equivalent[:, 1]
+    if d.shape[1] == 1:
+        return np.asarray(1 / (1 + paths.among * dynamic[:, None, :]))
+    return np.asarray(np.linalg.inv(np.eye(d.shape[1]) + paths.among * dynamic[:, None, :]))
+
+
+def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None, most: int, tolerance: float
+            ) -> tuple[Complex, Complex, str]:
+    """Newton's method, each step by GMRES (Saad and Schultz 1986), with halving where it overshoots."""
     linear = paths.linear(record)
     D = linear.copy() if start is None else start
     size = np.linalg.norm(linear) + 1e-300
-    G = np.zeros_like(D)
+    rest, G, d, v, g = _rest(paths, linear, D, laws)
+    error = np.linalg.norm(rest) / size
+    for _ in range(most):
+        if not np.isfinite(error) or error < tolerance:
+            break
+        slopes = [law.slope(d[:, j], v[:, j]) for j, law in enumerate(laws) if law.slope is not None]
+        stiff = np.stack([np.broadcast_to(a, len(d)) for a, _ in slopes], axis=1)
+        damp = np.stack([np.broadcast_to(b, len(d)) for _, b in slopes], axis=1)
+        inverse = _preconditioner(paths, d, v, g)
+
+        def apply(x: Complex, stiff: Array = stiff, damp: Array = damp, inverse: Complex = inverse) -> Complex:
+            dx, vx = paths.in_time(x)
+            return _mul(inverse, x + _mul(paths.among, paths.to_lines(stiff * dx + damp * vx)))
+
+        step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / error))
+        length, accepted = 1.0, False
+        for _ in range(6):
+            trial = _rest(paths, linear, D + length * step, laws)
+            new = np.linalg.norm(trial[0]) / size
+            if np.isfinite(new) and new < error * (1 - 0.1 * length):
+                accepted = True
+                break
+            length /= 2.5
+        if not accepted:
+            break
+        D = D + length * step
+        (rest, G, d, v, g), error = trial, new
+    return D, G, "ok" if error < 30 * tolerance else "not converged"
+
+
+def gmres(apply: Callable[[Complex], Complex], right: Complex, most: int, tolerance: float) -> Complex:
+    """Solve a real-linear equation in a complex unknown from zero, without restart, to a relative residual."""
+    norm = float(np.sqrt((np.abs(right) ** 2).sum()))
+    if norm == 0:
+        return right
+    basis = [right / norm]
+    hessenberg = np.zeros((most + 1, most))
+    best = np.zeros(0)
+    for k in range(most):
+        w = apply(basis[k])
+        for i, q in enumerate(basis):
+            hessenberg[i, k] = np.vdot(q, w).real
+            w = w - hessenberg[i, k] * q
+        hessenberg[k + 1, k] = np.linalg.norm(w)
+        target = np.zeros(k + 2)
+        target[0] = norm
+        best, *_ = np.linalg.lstsq(hessenberg[:k + 2, :k + 1], target, rcond=None)
+        left = np.linalg.norm(hessenberg[:k + 2, :k + 1] @ best - target)
+        if left < tolerance * norm or hessenberg[k + 1, k] < 1e-14 * norm:
+            break
+        basis.append(w / hessenberg[k + 1, k])
+    return np.asarray(sum(c * q for c, q in zip(best, basis, strict=False)))
+
+
+def _relax(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None, most: int, tolerance: float, depth: int = 8
+           ) -> tuple[Complex, Complex, str]:
+    """Anderson acceleration of the preconditioned fixed point, for laws whose slope along the path is not at hand."""
+    linear = paths.linear(record)
+    D = linear.copy() if start is None else start
+    size = np.linalg.norm(linear) + 1e-300
     states: list[Complex] = []
     steps: list[Complex] = []
-    best, kept = np.inf, (D, G)
-    J = D.shape[1]
-    eye = np.eye(J)
+    best, kept = np.inf, (D, np.zeros_like(D))
+    inverse = None
     for iteration in range(most):
-        d, v = paths.in_time(D)
-        g = np.stack([law(d[:, j], v[:, j], paths.dt) for j, law in enumerate(laws)], axis=1)
-        if not np.isfinite(g).all():
-            break
-        G = paths.to_lines(g)
-        rest = linear - np.einsum("kij,kj->ki", paths.among, G) - D if J > 1 else linear - paths.among[:, :, 0] * G - D
-        if iteration % 6 == 0:
-            equivalent = _equivalent(d, v, g)
-            dynamic = equivalent[:, 0] + paths.s[:, None] * equivalent[:, 1]
-            if J == 1:
-                inverse = 1 / (1 + paths.among[:, :, 0] * dynamic)
-            else:
-                inverse = np.linalg.inv(eye + paths.among * dynamic[:, None, :])
-            states, steps = [], []
+        rest, G, d, v, g = _rest(paths, linear, D, laws)
         error = np.linalg.norm(rest) / size
+        if not np.isfinite(error):
+            break
         if error < best:
             best, kept = error, (D, G)
         if error < tolerance:
-            return D, G, "ok"
-        step = inverse * rest if J == 1 else np.einsum("kij,kj->ki", inverse, rest)
-        states.append(D)
-        steps.append(step)
-        D = _anderson(states[-depth:], steps[-depth:])
-        if not np.isfinite(D).all():
             break
+        if iteration in (0, 3, 10, 20) or inverse is None:
+            inverse = _preconditioner(paths, d, v, g)
+            states, steps = [], []
+        states.append(D)
+        steps.append(_mul(inverse, rest))
+        D = _anderson(states[-depth:], steps[-depth:])
     return kept[0], kept[1], "ok" if best < 30 * tolerance else "not converged"
 
 

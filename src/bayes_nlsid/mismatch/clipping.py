@@ -1,0 +1,77 @@
+"""A clipped channel: the level at which it clips, and the evidence with the clipping undone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.calibrate import LinearFit, descend, finish, floored
+from bayes_nlsid.mismatch.case import Case
+from bayes_nlsid.mismatch.evidence import Evidence
+from bayes_nlsid.mismatch.linear import Family
+
+Array = NDArray[np.float64]
+
+
+def suspects(case: Case) -> list[tuple[int, float]]:
+    """Channels (index among usable ones) whose largest values crowd at one level, and that level, m/s²."""
+    out = []
+    for i, channel in enumerate(np.flatnonzero(case.usable)):
+        best = (0.0, 0.0)
+        peaks = {}
+        for record in case.records:
+            if record.sealed or record.kind == "off":
+                continue
+            y = np.abs(record.accel[:, channel])
+            top = float(y.max())
+            peaks[record.name] = top
+            near, below = int((y > 0.95 * top).sum()), int((y > 0.85 * top).sum())
+            crowd = near / max(below, 1)
+            if near > 8 and crowd > 0.42:
+                best = max(best, (crowd, float(np.median(y[y > 0.95 * top]))))
+        if best[0] > 0:
+            out.append((i, best[1]))
+    return out
+
+
+def undo(evidence: Evidence, fit: LinearFit, channel: int, level: float) -> Evidence:
+    """Evidence with the clipping of one channel taken out, as the linear model predicts it."""
+    spectra = evidence.spectra
+    half = np.zeros((len(spectra.names), spectra.block // 2 + 1), dtype=complex)
+    half[:, spectra.lines[spectra.excited]] = fit.model[:, channel] * spectra.force[:, spectra.excited]
+    y = np.fft.irfft(half * spectra.block, spectra.block, axis=1)
+    X = np.fft.rfft(np.clip(y, -level, level) - y, axis=1)[:, spectra.lines] / spectra.block
+    residual, H = evidence.residual.copy(), evidence.H.copy()
+    residual[:, :, channel] -= evidence.project(X)
+    H[:, channel] -= evidence.shadow(X)[spectra.excited]
+    return replace(evidence, residual=residual, H=H)
+
+
+def fit_clipping(fam: Family, evidence: Evidence, fit: LinearFit, channel: int, level: float) -> tuple[float, Evidence, LinearFit, float]:
+    """Level, cleaned evidence, recalibrated model and total −2 log likelihood with one channel clipped."""
+    s = evidence.spectra.s[evidence.excited]
+    variance = floored(evidence.H, evidence.variance)
+    # the first model must not know the clipped channel
+    blind = variance.copy()
+    blind[:, channel] *= 1e6
+    theta, _, _ = descend(fam, fit.theta, s, evidence.H, blind, 8)
+    now = finish(fam, theta, s, evidence.H, blind)
+    best: tuple[float, float, Evidence, LinearFit] | None = None
+    for grid in (level * np.linspace(0.85, 1.08, 12), None, None):
+        if grid is None:
+            assert best is not None
+            grid = best[1] * np.linspace(0.985, 1.015, 7)
+        for trial in grid:
+            cleaned = undo(evidence, now, channel, float(trial))
+            cost = cleaned.chi2
+            if best is None or cost < best[0]:
+                best = (cost, float(trial), cleaned, now)
+        assert best is not None
+        theta, _, _ = descend(fam, now.theta, s, best[2].H, variance, 6)
+        now = finish(fam, theta, s, best[2].H, variance)
+        best = (undo(evidence, now, channel, best[1]).chi2, best[1], undo(evidence, now, channel, best[1]), now)
+    assert best is not None
+    total = best[0] + best[3].cost + np.log(max(evidence.H.size, 2))
+    return best[1], best[2], best[3], float(total)

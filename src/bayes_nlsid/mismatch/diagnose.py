@@ -1,0 +1,355 @@
+"""All steps in order: read, detect, calibrate, search, compare on records not used, predict, put into words."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.calibrate import LinearFit, calibrate
+from bayes_nlsid.mismatch.case import Case, CaseRecord, read_case
+from bayes_nlsid.mismatch.catalogue import ROWS
+from bayes_nlsid.mismatch.clipping import fit_clipping, suspects
+from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
+from bayes_nlsid.mismatch.disturb import Disturbance, disturbances
+from bayes_nlsid.mismatch.effects import Effect, pack
+from bayes_nlsid.mismatch.evidence import Evidence, gather
+from bayes_nlsid.mismatch.explain import sizes
+from bayes_nlsid.mismatch.linear import Family, family
+from bayes_nlsid.mismatch.motion import bed
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis
+from bayes_nlsid.mismatch.probability import SHIPPED, Key, Layer, Score, Scores, probabilities
+from bayes_nlsid.mismatch.prove import Bands, Predictor, calibrate_bands, elpd_difference, nrmse
+from bayes_nlsid.mismatch.search import Found, search
+from bayes_nlsid.mismatch.spectra import Spectra, burst_spectra, noise_density, steady_spectra
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+@final
+@dataclass(frozen=True)
+class Rival:
+    """A hypothesis of any kind with its gain over ``none``."""
+
+    key: Key
+    gain: float
+    alone: float = 0.0
+    hypothesis: Hypothesis | None = None
+    clip: tuple[tuple[int, float], ...] = ()
+    extra: tuple[Effect, ...] = ()
+
+
+@final
+@dataclass(frozen=True)
+class Analysis:
+    """Everything found in a case before it is put into words; what the probability layer is fitted on."""
+
+    case: Case
+    evidence: Evidence
+    family: Family
+    fit: LinearFit
+    rivals: tuple[Rival, ...]
+    scores: Scores
+    found: Found
+    held: tuple[CaseRecord, ...]
+    noise: Array
+    notes: tuple[str, ...]
+
+
+def diagnose(path: str | Path | Case, seed: int = 0, progress: Progress | None = None, layer: Layer = SHIPPED) -> Diagnosis:
+    """Locate the mismatch of a case, name what is missing, add it and test it on records not used.
+
+    Parameters
+    ----------
+    path : case folder, or a Case.
+    seed : int
+        For the draws behind parameter intervals.
+    progress : callable or None
+        Told in words what is being done.
+    layer : Layer
+        Numbers that turn scores into probabilities.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be used at all.
+    """
+    begun = clock.perf_counter()
+    case = path if isinstance(path, Case) else read_case(path)
+    say = progress or (lambda text: None)
+    analysis = analyse(case, say)
+    from bayes_nlsid.mismatch.answer import answer
+
+    return answer(analysis, seed, layer, begun, say)
+
+
+def analyse(case: Case, say: Progress) -> Analysis:
+    """Everything but the words: evidence, calibration, all rivals with their gains."""
+    notes = list(case.notes)
+    spectra, held, floor = _groups(case, notes)
+    evidence = gather(spectra, case.band)
+    fam = family(case)
+    say("calibrating the linear model")
+    linear = not evidence.statistic > 1.1
+    fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=6 if linear else 2)
+    bench = _bench(case, fam, fit, evidence)
+    say("searching laws, places and channels")
+    places = list(fam.places)
+    found = search(bench, fit, places, case.band, say)
+    rivals = [_rival(h, found.none) for h in found.singles]
+    best_alone = {r.key: r.gain for r in rivals}
+    for h in found.doubles:
+        one = _rival(h, found.none)
+        alone = max([best_alone.get((k,), -np.inf) for k in one.key] + [rivals[0].gain if rivals else 0.0])
+        rivals.append(replace(one, alone=max(alone, 0.0)))
+    rivals += _clipping(case, bench, fit, found.none, places, rivals, say)
+    rivals = _disturbed(disturbances(case, spectra if spectra.kind == "steady" else None, fam, fit.fields.modes), rivals, case)
+    rivals.sort(key=lambda r: -r.gain)
+    return Analysis(case, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals), found, held, floor, tuple(notes))
+
+
+def _groups(case: Case, notes: list[str]) -> tuple[Spectra, tuple[CaseRecord, ...], Array]:
+    """Records to fit, records never fitted, and the noise rms per usable channel."""
+    steady, bursts = case.select("steady"), case.select("burst")
+    if steady:
+        held: tuple[CaseRecord, ...] = bursts
+        used = steady
+        if not bursts and len(steady) >= 4:
+            held = (max(steady[1:], key=lambda r: (r.level, r.start)),)
+            used = tuple(r for r in steady if r is not held[0])
+            notes.append(f"No burst is available: record {held[0].name} is kept aside to judge predictions.")
+        spectra = steady_spectra(case, used)
+    else:
+        held = (bursts[-1],) if len(bursts) > 1 else ()
+        used = bursts[:-1] if len(bursts) > 1 else bursts
+        density, how = noise_density(case, None)
+        notes.append(f"Noise is taken from the {how}.")
+        longest = max(len(r.force) for r in used)
+        same = tuple(r for r in used if len(r.force) == longest)
+        if len(same) < len(used):
+            notes.append("Bursts of different lengths: only the longest are fitted.")
+        spectra = burst_spectra(case, same, density)
+    density, _ = noise_density(case, spectra if spectra.kind == "steady" else None)
+    rms = np.sqrt(density.mean(0))
+    offs = [r for r in case.records if r.kind == "off" and not r.sealed]
+    if offs:
+        rms = np.maximum(rms, offs[0].accel[:, case.usable].std(0))
+    if not held:
+        notes.append("No record is left that was not fitted: an improvement cannot be proved.")
+    return spectra, held, rms
+
+
+def _bench(case: Case, fam: Family, fit: LinearFit, evidence: Evidence) -> Bench:
+    names = tuple(n for n, ok in zip(case.sensors, case.usable, strict=True) if ok)
+    K = fam.K_parts.sum(0) + fam.K_rest
+    stiffness = {k: 1 / max(float(v @ np.linalg.solve(K, v)), 1e-30) for k, v in fam.places.items()}
+    mass = 0.05 * float(np.abs(fam.base @ (case.base @ case.base * 0 + np.ones(1)))) if False else _mass_scale(case)
+    rows = np.array(list(fam.places.values())) if fam.places else np.zeros((0, len(K)))
+    scale = sizes(bed(fit.fields.modes, evidence.spectra, rows, fam.shaker), list(fam.places)) if len(rows) else {}
+    return Bench(fam, evidence, names, mass, stiffness, scale)
+
+
+def _mass_scale(case: Case) -> float:
+    """Five per cent of the moving mass (of the rigid motion of the base if that is stated)."""
+    r = case.base if np.abs(case.base).any() else case.shaker
+    total = float(r @ case.M @ r) / max(float(np.abs(r).max()) ** 2, 1e-300)
+    return max(0.05 * total, 1e-9)
+
+
+def _rival(h: Hypothesis, none: float) -> Rival:
+    return Rival(tuple(sorted(e.key for e in h.effects)), none - h.cost, 0.0, h)
+
+
+def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: list[str], rivals: list[Rival], say: Progress) -> list[Rival]:
+    """Clipped channels, alone and together with what the unclipped evidence then shows."""
+    out: list[Rival] = []
+    for channel, level in suspects(case)[:3]:
+        say(f"undoing the clipping of {bench.channels[channel]}")
+        level, cleaned, refit, cost = fit_clipping(bench.family, bench.evidence, fit, channel, level)
+        gain = none - cost
+        name = bench.channels[channel]
+        if gain < 10:
+            continue
+        effect = Effect("clipping", name, None, np.array([level]), ("level",), ("m/s^2",))
+        alone = Rival((("clipping", name),), gain, 0.0, _only_linear(bench, refit, cleaned, cost), ((channel, level),), (effect,))
+        out.append(alone)
+        if gain > 0.3 * max([r.gain for r in rivals] + [0.0]):
+            more = search(replace(bench, evidence=cleaned), refit, places, case.band, say)
+            for h in more.singles[:2]:
+                key = tuple(sorted([("clipping", name), *[e.key for e in h.effects]]))
+                out.append(Rival(key, none - h.cost - np.log(bench.evidence.H.size), gain, h, ((channel, level),), (effect,)))
+    return out
+
+
+def _only_linear(bench: Bench, fit: LinearFit, evidence: Evidence, cost: float) -> Hypothesis:
+    return Hypothesis((), (), fit, evidence.chi2, cost, np.zeros((0, 0)), evidence.residual, "ok")
+
+
+def _disturbed(found: list[Disturbance], rivals: list[Rival], case: Case) -> list[Rival]:
+    """Disturbances alone, and together with the best coherent rival."""
+    out = list(rivals)
+    known = set(case.classes)
+    strong = [d for d in found if d.gain > 25 and d.cls in known]
+    best = max(rivals, key=lambda r: r.gain) if rivals else None
+    for d in found:
+        if d.cls not in known or d.gain <= 0:
+            continue
+        effect = Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",))
+        out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effect,)))
+        if best is not None and d in strong and best.gain > 25 and len(best.key) == 1 and best.key[0] != (d.cls, d.place):
+            key = tuple(sorted([*best.key, (d.cls, d.place)]))
+            out.append(Rival(key, best.gain + d.gain, max(best.gain, d.gain), best.hypothesis, best.clip, (*best.extra, effect)))
+    for i, a in enumerate(strong):
+        for b in strong[i + 1:]:
+            if a.cls != b.cls:
+                key = tuple(sorted([(a.cls, a.place), (b.cls, b.place)]))
+                out.append(Rival(key, a.gain + b.gain, max(a.gain, b.gain)))
+    return out
+
+
+def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival]) -> Scores:
+    items = tuple(Score(r.key, float(r.gain), float(r.alone)) for r in rivals)
+    best = next((r.hypothesis for r in rivals if r.hypothesis is not None), None)
+    total = evidence.values + fit.dof
+    leftover = found.none if best is None else best.misfit_records + best.fit.cost
+    above = max(evidence.chi2 - evidence.values, 0.0)
+    unexplained = 0.0
+    if above > 12 * np.sqrt(2 * evidence.values) and best is not None:
+        unexplained = float(np.clip((best.misfit_records - evidence.values) / above, 0, 1))
+    return Scores(items, unexplained, float(max(leftover / total, 1.0)))
+
+
+def intervals(h: Hypothesis, effect: Effect, dispersion: float, seed: int) -> tuple[dict[str, Any], ...]:
+    """5, 50 and 95 % quantiles of the parameters of one effect from the curvature at the optimum (Laplace)."""
+    rng = np.random.default_rng(seed)
+    if effect.cls == "linear_stiffness" or not effect.is_force:
+        return _linear_intervals(h, effect, dispersion, rng)
+    edge = 0
+    for e in h.forces:
+        count = len(pack(e))
+        if e is effect:
+            break
+        edge += count
+    covariance = np.linalg.pinv(h.curvature)[edge:edge + count, edge:edge + count] * dispersion
+    x0 = pack(effect)
+    draws = rng.multivariate_normal(x0, (covariance + covariance.T) / 2 + 1e-12 * np.eye(count), size=400, method="eigh")
+    out = []
+    free = list(range(len(effect.values))) if effect.law is None else [i for i, k in enumerate(effect.law.free) if k != "fixed"]
+    for column, i in enumerate(free):
+        if effect.law is None:
+            values = draws[:, column] * max(float(np.abs(effect.values).max()), 1e-12)
+        elif effect.law.free[i] == "log":
+            values = np.exp(np.clip(draws[:, column], -80, 80))
+        else:
+            scale = max(abs(float(effect.values[i])), 1e-12) if effect.law.term.name == "one_sided_spring" else 1.0
+            values = draws[:, column] * scale
+        q = np.quantile(values, [0.05, 0.5, 0.95])
+        out.append({"name": f"{effect.cls}[{effect.place}].{effect.names[i]}", "unit": effect.units[i],
+                    "q05": float(q[0]), "q50": float(q[1]), "q95": float(q[2])})
+    return tuple(out)
+
+
+def _linear_intervals(h: Hypothesis, effect: Effect, dispersion: float, rng: np.random.Generator) -> tuple[dict[str, Any], ...]:
+    covariance = np.linalg.pinv(h.fit.normal) * dispersion
+    if effect.cls == "linear_stiffness":
+        value = np.log(float(effect.values[0]))
+        # the index of the place among the scales is where theta reproduces the value
+        i = int(np.argmin(np.abs(h.fit.theta - value)))
+        q = np.exp(value + np.sqrt(covariance[i, i]) * np.array([-1.645, 0, 1.645]))
+        return ({"name": f"linear_stiffness[{effect.place}].factor", "unit": "", "q05": float(q[0]), "q50": float(q[1]),
+                 "q95": float(q[2])},)
+    edge = 0
+    kinds = list(h.kinds)
+    for e in h.effects:
+        if e.is_force or e.cls == "linear_stiffness":
+            continue
+        k = kinds.pop(0)
+        if e is effect:
+            first = len(h.fit.theta) + edge
+            x = h.fit.x[edge:edge + len(k.start)]
+            block = covariance[first:first + len(x), first:first + len(x)]
+            draws = rng.multivariate_normal(x, (block + block.T) / 2 + 1e-14 * np.eye(len(x)), size=400, method="eigh")
+            values = np.array([np.atleast_1d(k.natural(d)) for d in draws])
+            q = np.quantile(values, [0.05, 0.5, 0.95], axis=0)
+            return tuple({"name": f"{e.cls}[{e.place}].{n}", "unit": u, "q05": float(q[0, j]), "q50": float(q[1, j]), "q95": float(q[2, j])}
+                         for j, (n, u) in enumerate(zip(k.names, k.units, strict=True)))
+        edge += len(k.start)
+    return ()
+
+
+@final
+@dataclass(frozen=True)
+class Proof:
+    """Held-out comparison of the model as delivered, re-tuned and extended.
+
+    ``records``: names; ``nominal``, ``updated``, ``extended``, ``noise``: NRMSE over them; ``elpd``, ``elpd_se``;
+    ``withdrawn``: the extension made a held-out record worse; ``bands``: of the model finally used; ``coverage``: on the same records.
+    """
+
+    records: tuple[str, ...]
+    nominal: float
+    updated: float
+    extended: float
+    noise: float
+    elpd: float
+    elpd_se: float
+    withdrawn: bool
+    bands: Bands
+    coverage: float
+    waves: dict[str, Array]
+
+
+def prove(analysis: Analysis, rival: Rival | None) -> tuple[Proof, Predictor]:
+    """Run the held-out records with all models; the predictor that comes back is the one that may be used."""
+    case, spectra = analysis.case, analysis.evidence.spectra
+    channels = int(case.usable.sum())
+    updated = Predictor(analysis.family, analysis.fit, None, channels, (), spectra)
+    extended = updated
+    if rival is not None and rival.hypothesis is not None:
+        extended = Predictor(analysis.family, rival.hypothesis.fit, rival.hypothesis, channels, rival.clip, spectra)
+    elif rival is not None and rival.clip:
+        extended = replace(updated, clip=rival.clip)
+    nominal = Predictor(analysis.family, None, None, channels, (), spectra)
+    held = analysis.held or ()
+    if not held:
+        held = tuple(r for r in case.records if not r.sealed and r.kind != "off")[:1]
+    measured = [r.accel[:, case.usable] for r in held]
+    runs = {name: [p.run(case, r) for r in held] for name, p in (("nominal", nominal), ("updated", updated), ("extended", extended))}
+    waves = {name: [w for w, _ in many] for name, many in runs.items()}
+    bad = any(not np.isfinite(w).all() for w in waves["extended"]) or any(s != "ok" for _, s in runs["extended"])
+    errors = {name: float(np.sqrt(sum(((m - w) ** 2).sum() for m, w in zip(measured, many, strict=True))
+                                  / sum((m ** 2).sum() for m in measured))) for name, many in waves.items()}
+    worse = any(nrmse(m, e) > 1.01 * nrmse(m, u) for m, e, u in zip(measured, waves["extended"], waves["updated"], strict=True))
+    withdrawn = bool(extended is not updated and (worse or (bad and errors["extended"] > 0.9 * errors["updated"]) or
+                                                  not np.isfinite(errors["extended"])))
+    chosen, name = (updated, "updated") if withdrawn else (extended, "extended")
+    bands = calibrate_bands(analysis.noise, measured, waves[name], case.rate)
+    first = calibrate_bands(analysis.noise, measured, waves["updated"], case.rate)
+    elpd, se = (0.0, 0.0) if chosen is updated else elpd_difference(np.concatenate(measured), np.concatenate(waves["updated"]),
+                                                                    np.concatenate(waves[name]), first, bands, case.rate)
+    y, p = np.concatenate(measured), np.concatenate(waves[name])
+    coverage = float((np.abs(y - p) < bands.factor * bands.sd(p, case.rate)).mean())
+    floor = float(np.sqrt((analysis.noise ** 2).mean() / np.mean([(m ** 2).mean() for m in measured])))
+    stored = {"measured": measured[0], "nominal": waves["nominal"][0], "updated": waves["updated"][0], "extended": waves[name][0]}
+    return Proof(tuple(r.name for r in held), errors["nominal"], errors["updated"], errors[name], floor, elpd, se, withdrawn, bands,
+                 coverage, stored), chosen
+
+
+def claim(effect: tuple[str, str]) -> str:
+    """What a hypothesis says in words."""
+    cls, place = effect
+    return ROWS[cls].claim.format(place=place if place != "-" else "an unknown place") if cls in ROWS else f"{cls} at {place}"
+
+
+def rank(analysis: Analysis, layer: Layer) -> dict[Key, float]:
+    """Probability of every hypothesis."""
+    return probabilities(analysis.scores, layer)
+
+
+__all__ = ["Analysis", "Named", "Proof", "Rival", "analyse", "claim", "diagnose", "intervals", "prove", "rank"]

@@ -1,0 +1,334 @@
+"""Joint estimation of the last rivals: laws and linear parameters together, by forward simulation.
+
+Given the linear model, the law's parameters move so that the simulated force explains the projected residual (Gauss–Newton with derivatives
+of the self-consistent simulation); given the law, the transfer function it leaves is calibrated anew. The two alternate; both costs
+are parts of one −2 log likelihood, on which all rivals are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, descend, finish, floored
+from bayes_nlsid.mismatch.catalogue import Size
+from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
+from bayes_nlsid.mismatch.evidence import Evidence
+from bayes_nlsid.mismatch.explain import Candidate
+from bayes_nlsid.mismatch.linear import Attachment, Family, receptances, solve
+from bayes_nlsid.mismatch.motion import FINER, Bed, LawAlong, bed, settle
+from bayes_nlsid.mismatch.spectra import Spectra
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
+
+
+@final
+@dataclass(frozen=True)
+class Bench:
+    """What every estimation of one case shares."""
+
+    family: Family
+    evidence: Evidence
+    channels: tuple[str, ...]
+    mass: float
+    stiffness: dict[str, float]
+    sizes: dict[str, Size]
+
+
+@final
+@dataclass(frozen=True)
+class Hypothesis:
+    """Up to two effects with estimated parameters.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+    kinds : tuple of LinearKind
+        Of the linear effects among them, in order.
+    fit : LinearFit
+        Linear model beside the effects.
+    misfit_records : float
+        −2 log likelihood of the projected residual.
+    cost : float
+        ``misfit_records`` + cost of the linear fit + what its parameters are charged.
+    curvature : ndarray
+        Curvature of cost/2 in the force parameters (search coordinates).
+    status : str
+    """
+
+    effects: tuple[Effect, ...]
+    kinds: tuple[LinearKind, ...]
+    fit: LinearFit
+    misfit_records: float
+    cost: float
+    curvature: Array
+    residual: Complex
+    status: str
+
+    @property
+    def forces(self) -> tuple[Effect, ...]:
+        """Effects that are forces depending on motion."""
+        return tuple(e for e in self.effects if e.is_force)
+
+    def parts(self, channels: int) -> Callable[[Complex], tuple[tuple[Attachment, ...], Chain | None]]:
+        """``s -> (attachments, chain)`` at the estimated parameters."""
+        ext = extension(self.kinds, channels)
+        x = self.fit.x
+        return lambda s: ((), None) if ext is None else ext.parts(x, s)
+
+
+def law_of(effect: Effect, time: float, periodic: bool) -> LawAlong:
+    """The force of an effect along a motion, in a record taken at ``time`` (−1 to 1 over the test day of the fitted records)."""
+    if effect.law is None:
+        stiffness = float(effect.values @ np.array([time, time ** 2]))
+        return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))))
+    force = partial(_along, effect, periodic)
+    return LawAlong(force, None if effect.law.term.memory != "none" else partial(_slope, effect))
+
+
+def _along(effect: Effect, periodic: bool, d: Array, v: Array, dt: float) -> Array:
+    assert effect.law is not None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return along_period(effect.law, effect.values, d, v, dt, periodic)
+
+
+def _slope(effect: Effect, d: Array, v: Array) -> tuple[Array, Array]:
+    assert effect.law is not None
+    with np.errstate(over="ignore", invalid="ignore"):
+        stiffness, damping = effect.law.term.slope(d, v, *effect.values)
+    return np.broadcast_to(stiffness, d.shape), np.broadcast_to(damping, d.shape)
+
+
+def day(spectra: Spectra, starts: Array) -> Array:
+    """Times of records on the scale of drifts: −1 to 1 over the fitted records."""
+    middle = spectra.starts.mean()
+    return np.asarray((starts - middle) / max(np.abs(spectra.starts - middle).max(), 1e-9))
+
+
+@final
+@dataclass(frozen=True)
+class Simulated:
+    """Forces at the places on the analysed lines (R, L, J) and the motions they came from, for warm starts."""
+
+    lines: Complex
+    motions: tuple[Complex, ...]
+    status: str
+
+
+def simulate(paths: Bed, spectra: Spectra, effects: tuple[Effect, ...], unique: list[int], start: tuple[Complex, ...] | None,
+             tolerance: float = 1e-5, most: int = 40) -> Simulated:
+    """Steady forces of all effects in every record; records with one force history are computed once (``unique``)."""
+    times = day(spectra, spectra.starts)
+    drifting = any(e.law is None for e in effects)
+    out = np.zeros((len(unique), len(spectra.lines), len(effects)), dtype=complex)
+    motions: list[Complex] = []
+    status = "ok"
+    for r, same in enumerate(unique):
+        if same < r and not drifting:
+            out[r] = out[same]
+            motions.append(motions[same])
+            continue
+        laws = tuple(law_of(e, times[r], paths.periodic) for e in effects)
+        D, G, state = settle(paths, r, laws, None if start is None else start[r], tolerance=tolerance, most=most)
+        status = status if state == "ok" else state
+        out[r] = G[spectra.lines]
+        motions.append(D)
+    return Simulated(out, tuple(motions), status)
+
+
+def repeats(spectra: Spectra) -> list[int]:
+    """For every record the first one with the same force history."""
+    out = []
+    w = spectra.waveforms
+    norms = np.linalg.norm(w, axis=1)
+    for r in range(len(w)):
+        first = r
+        for q in range(r):
+            if abs(norms[r] - norms[q]) < 2e-3 * norms[r] and w[r] @ w[q] > 0.9995 * norms[r] * norms[q]:
+                first = q
+                break
+        out.append(first)
+    return out
+
+
+def widened(fam: Family, places: set[str]) -> Array:
+    """Prior with the stiffness of some places released."""
+    sd = fam.prior_sd.copy()
+    for i, name in enumerate(fam.names[:len(fam.K_parts)]):
+        if name in places:
+            sd[i] *= WIDENING
+    return sd
+
+
+def paths_to_sensors(bench: Bench, fit: LinearFit, places: list[str], s: Complex, parts: tuple[tuple[Attachment, ...], Chain | None]
+                     ) -> Complex:
+    """Accelerance (L, S, J) from forces at places to the channels as reported."""
+    fam, modes = bench.family, fit.fields.modes
+    rows = np.array([fam.places[p] for p in places])
+    attach, chain = parts
+    out = receptances(modes, s, fam.sensors, rows, attach)
+    m = fam.modes
+    S, b = (fam.sensors @ modes.basis)[:, :m] * fit.shape_errors, (rows @ modes.basis)[:, :m]
+    out = out + np.einsum("lm,sm,jm->lsj", 1 / modes.denominators(s)[:, :m], S, b, optimize=True)
+    out = s[:, None, None] ** 2 * out
+    return np.asarray(out if chain is None else np.moveaxis(chain.apply(np.moveaxis(out, 2, 0)), 0, 2))
+
+
+def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], rounds: int = 5) -> Hypothesis:
+    """Joint estimation of up to two effects; see the module.
+
+    Parameters
+    ----------
+    start : linear fit to begin from.
+    candidates : effects with starting values from the first search.
+    """
+    fam, evidence = bench.family, bench.evidence
+    effects = tuple(c.effect for c in candidates)
+    kinds = tuple(kind_of(bench, c) for c in candidates if not c.effect.is_force and c.effect.cls != "linear_stiffness")
+    ext = extension(kinds, len(bench.channels))
+    sd = widened(fam, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
+    forces = tuple(e for e in effects if e.is_force)
+    spectra = evidence.spectra
+    s = spectra.s[spectra.excited]
+    variance = floored(evidence.H, evidence.variance)
+    theta = start.theta
+    x = np.zeros(0) if ext is None else ext.x
+    if ext is not None and len(start.x) and len(start.x) < len(x):
+        x = np.concatenate([start.x, x[len(start.x):]])
+    if not forces:
+        theta, x, _ = descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=x)
+        fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
+        return _hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
+    unique = repeats(spectra)
+    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
+    reference, damping = forces, 1e-2
+    warm: tuple[Complex, ...] | None = None
+    best: tuple[float, Hypothesis] | None = None
+    for turn in range(rounds):
+        forces, warm, damping, misfit, normal, lines, h, status = _fit_laws(bench, fit, ext, x, forces, reference, unique, warm, damping)
+        shadow = np.stack([evidence.shadow(lines[:, :, j]) for j in range(len(forces))], axis=-1)[spectra.excited]
+        cleaned = evidence.H + np.einsum("lsj,lj->ls", h[spectra.excited], shadow)
+        theta, x, _ = descend(fam, fit.theta, s, cleaned, variance, 6, prior_sd=sd, extension=ext, x=x, tol=0.1)
+        new = finish(fam, theta, s, cleaned, variance, ext, x, sd)
+        residual = evidence.residual + np.einsum(
+            "lsj,rlj->rls", h, np.stack([evidence.project(lines[:, :, j]) for j in range(len(forces))], axis=-1), optimize=True)
+        found = _hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status)
+        if best is None or found.cost < best[0]:
+            better = best is None or best[0] - found.cost > 1.0 + 1e-3 * found.cost
+            best = (found.cost, found)
+            if not better and turn > 1:
+                break
+        elif turn > 1:
+            break
+        fit = new
+    assert best is not None
+    return best[1]
+
+
+def kind_of(bench: Bench, candidate: Candidate) -> LinearKind:
+    """Parametrisation of a linear candidate on this bench."""
+    e = candidate.effect
+    channel = bench.channels.index(e.place) if e.place in bench.channels else -1
+    return linear_kind(bench.family, e.cls, e.place, channel, bench.mass, candidate.frequency, e.kind,
+                       bench.stiffness.get(e.place, 1.0), candidate.other, candidate.start)
+
+
+def _merge(effects: tuple[Effect, ...], forces: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    found = list(forces)
+    return tuple(found.pop(0) if e.is_force else e for e in effects)
+
+
+def _hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKind, ...], fit: LinearFit, misfit: float, curvature: Array,
+                residual: Complex, status: str) -> Hypothesis:
+    free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
+    charge = free * np.log(max(bench.evidence.H.size, 2))
+    named, edges = [], 0
+    remaining = list(kinds)
+    for e in effects:
+        if not e.is_force and e.cls != "linear_stiffness":
+            k = remaining.pop(0)
+            part = fit.x[edges:edges + len(k.start)]
+            edges += len(k.start)
+            e = replace(e, values=np.asarray(k.natural(part)), names=k.names, units=k.units)
+        elif e.cls == "linear_stiffness":
+            i = bench.family.names.index(e.place)
+            e = replace(e, values=np.array([np.exp(fit.theta[i])]), names=("stiffness over nominal",), units=("",))
+        named.append(e)
+    return Hypothesis(tuple(named), kinds, fit, misfit, misfit + fit.cost + charge, curvature, residual, status)
+
+
+def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, forces: tuple[Effect, ...], reference: tuple[Effect, ...],
+              unique: list[int], warm: tuple[Complex, ...] | None, damping: float, steps: int = 2
+              ) -> tuple[tuple[Effect, ...], tuple[Complex, ...], float, float, Array, Complex, Complex, str]:
+    """A few Gauss–Newton steps of the law parameters against the projected residual, the linear model held."""
+    fam, evidence = bench.family, bench.evidence
+    spectra = evidence.spectra
+    places = [e.place for e in forces]
+    rows = np.array([fam.places[p] for p in places])
+    parts = ((lambda s: ((), None)) if ext is None else partial(ext.parts, x))
+    remembers = any(e.law is not None and e.law.term.memory != "none" for e in forces)
+    paths = bed(fit.fields.modes, spectra, rows, fam.shaker, lambda s: parts(s)[0], finer=1 if remembers else FINER)
+    h = paths_to_sensors(bench, fit, places, spectra.s, parts(spectra.s))
+    root = np.sqrt(2 * evidence.trust[:, None, None] * evidence.weight)
+    data = evidence.residual * root
+
+    def response(lines: Complex) -> Complex:
+        projected = np.stack([evidence.project(lines[:, :, j]) for j in range(lines.shape[2])], axis=-1)
+        return np.asarray(-np.einsum("lsj,rlj->rls", h, projected, optimize=True) * root)
+
+    packs = [pack(e) for e in forces]
+    edges = np.concatenate([[0], np.cumsum([len(p) for p in packs])]).astype(int)
+
+    def effects_at(y: Array) -> tuple[Effect, ...]:
+        return tuple(unpack(e, y[a:b], ref) for e, ref, a, b in zip(forces, reference, edges[:-1], edges[1:], strict=True))
+
+    y = np.concatenate([_packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
+    now = simulate(paths, spectra, forces, unique, warm)
+    rest = data - response(now.lines)
+    cost = float((np.abs(rest) ** 2).sum())
+    normal = np.eye(len(y))
+    for _ in range(steps):
+        columns = np.empty((len(y), *rest.shape), dtype=complex)
+        for i in range(len(y)):
+            step = 1e-3
+            moved = simulate(paths, spectra, effects_at(y + step * (np.arange(len(y)) == i)), unique, now.motions, most=12)
+            columns[i] = (response(moved.lines) - response(now.lines)) / step
+        flat, r = columns.reshape(len(y), -1), rest.ravel()
+        normal = (flat.conj() @ flat.T).real + 1e-2 * np.eye(len(y))
+        gradient = (flat.conj() @ r).real
+        accepted = False
+        for _ in range(4):
+            trial = y + np.clip(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), -0.7, 0.7)
+            there = simulate(paths, spectra, effects_at(trial), unique, now.motions)
+            left = data - response(there.lines)
+            new = float((np.abs(left) ** 2).sum())
+            if np.isfinite(new) and new < cost:
+                accepted = True
+                break
+            damping = max(8 * damping, 1e-3)
+        if not accepted:
+            break
+        gain, y, now, rest, damping = cost - new, trial, there, left, max(damping / 8, 1e-6)
+        cost = new
+        if gain < 1e-3 * cost:
+            break
+    return effects_at(y), now.motions, damping, cost, normal, now.lines, h, now.status
+
+
+def _packed(effect: Effect, reference: Effect) -> Array:
+    """Search coordinates of ``effect`` on the scales of ``reference``."""
+    if effect.law is None:
+        return np.asarray(effect.values / max(float(np.abs(reference.values).max()), 1e-12))
+    out = pack(effect)
+    free = [i for i, kind in enumerate(effect.law.free) if kind != "fixed"]
+    for k, i in enumerate(free):
+        if effect.law.free[i] == "linear" and effect.law.term.name == "one_sided_spring":
+            out[k] = effect.values[i] / max(abs(float(reference.values[i])), 1e-12)
+    return out

@@ -1,0 +1,160 @@
+"""From the first search to ranked hypotheses: who is estimated jointly, in what order, and when a second effect is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.calibrate import LinearFit
+from bayes_nlsid.mismatch.effects import Effect
+from bayes_nlsid.mismatch.explain import Candidate, Latent, scan_forces, scan_linear
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+WORTH = 14.0  # smallest gain of one regression that is looked at more closely
+
+
+@final
+@dataclass(frozen=True)
+class Found:
+    """Result of a search.
+
+    Parameters
+    ----------
+    none : float
+        −2 log likelihood with nothing but the calibrated linear model.
+    singles, doubles : tuple of Hypothesis
+        Estimated, best first.
+    latents : tuple of Latent
+    first : tuple of Candidate
+        The first search, best first.
+    """
+
+    none: float
+    singles: tuple[Hypothesis, ...]
+    doubles: tuple[Hypothesis, ...]
+    latents: tuple[Latent, ...]
+    first: tuple[Candidate, ...]
+
+
+def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress) -> Found:
+    """Singles, then pairs that begin with the best single."""
+    none = bench.evidence.chi2 + fit.cost
+    forces, latents, _ = scan_forces(bench.family, fit, bench.evidence, places)
+    linear = scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)
+    top_force = forces[0].gain if forces else 0.0
+    top_linear = linear[0].gain if linear else 0.0
+    short = _short_forces(forces, top_linear)
+    if top_linear > 0.15 * top_force:
+        short += _short_linear(bench, linear, band, fit)
+    say(f"estimating {len(short)} rivals jointly")
+    singles = sorted((estimate(bench, fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    singles = _finish_leaders(bench, singles, none)
+    doubles: list[Hypothesis] = []
+    if singles and none - singles[0].cost > 30:
+        say("looking for a second effect")
+        doubles = _second(bench, singles[0], places, band)
+    return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
+
+
+def _unique(candidates: list[Candidate]) -> list[Candidate]:
+    seen: set[tuple[str, str]] = set()
+    out = []
+    for c in candidates:
+        if c.effect.key not in seen:
+            seen.add(c.effect.key)
+            out.append(c)
+    return out
+
+
+def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> list[Candidate]:
+    """The best laws over all places, and every law worth a look at the best place."""
+    if not candidates or candidates[0].gain < WORTH:
+        return []
+    top = candidates[0]
+    keep = [c for c in _unique(candidates) if c.gain > max(WORTH, 0.2 * top.gain, 0.2 * other)]
+    here = [c for c in keep if c.effect.place == top.effect.place]
+    there = [c for c in keep if c.effect.place != top.effect.place and c.gain > 0.35 * top.gain]
+    remembered = 0
+    out = []
+    for c in sorted(here[:5] + there, key=lambda c: -c.gain):
+        if c.effect.cls == "hysteresis":
+            remembered += 1
+            if remembered > 2:
+                continue
+        out.append(c)
+    return out[:most]
+
+
+def _short_linear(bench: Bench, candidates: list[Candidate], band: tuple[float, float], fit: LinearFit, most: int = 7) -> list[Candidate]:
+    """The best linear effects, and a relaxing branch at every joint, whose column is a poor guide when the branch is stiff."""
+    if not candidates or candidates[0].gain < WORTH:
+        return []
+    top = candidates[0].gain
+    limit = max(WORTH, 0.15 * top)
+    out = [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
+    centre = float(np.sqrt(band[0] * band[1]))
+    if top > 40:
+        slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, 1.5 * centre) for place in bench.family.places]
+        leftover = fit.cost - fit.dof
+        # where one branch explains nothing, its relatives need not be asked with more effort
+        out += slow if leftover > 40 else []
+    return out
+
+
+def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> list[Hypothesis]:
+    """More rounds for force hypotheses that are still in the race."""
+    if not singles:
+        return singles
+    best = singles[0].cost
+    gain = none - best
+    out = []
+    for i, h in enumerate(singles):
+        if i < 3 and h.forces and gain > 30 and h.cost - best < 0.35 * gain:
+            h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=8)), key=lambda z: z.cost)
+        out.append(h)
+    return sorted(out, key=lambda z: z.cost)
+
+
+def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float]) -> list[Hypothesis]:
+    """Pairs of the best single with what its residual still shows."""
+    forces, _, _ = scan_forces(bench.family, first.fit, bench.evidence, places, first.residual)
+    linear = scan_linear(bench.family, first.fit, bench.channels, bench.mass, bench.stiffness, band)
+    own = {e.key for e in first.effects}
+    pool = [c for c in _unique(forces)[:3] + _unique([c for c in linear if c.effect.kind != "maxwell"])[:4]
+            if c.gain > 25 and c.effect.key not in own]
+    lead = _lead(first)
+    out = []
+    for c in sorted(pool, key=lambda c: -c.gain)[:5]:
+        pair = (*lead, c)
+        start = first.fit
+        if not first.forces and c.effect.is_force:
+            pair = (c, *lead)
+        out.append(estimate(bench, start, pair, rounds=4))
+    return sorted(out, key=lambda h: h.cost)
+
+
+def _lead(first: Hypothesis) -> tuple[Candidate, ...]:
+    """Candidates that reproduce a hypothesis as a start: forces keep their values, linear effects their coordinates."""
+    out, edge = [], 0
+    kinds = list(first.kinds)
+    for e in first.effects:
+        if e.is_force or e.cls == "linear_stiffness":
+            out.append(Candidate(e, 0.0))
+            continue
+        k = kinds.pop(0)
+        x = first.fit.x[edge:edge + len(k.start)]
+        edge += len(k.start)
+        logs = e.cls in ("unmodelled_mode",) or e.kind == "maxwell"
+        frequency = float(e.values[1]) if e.cls == "unmodelled_mode" else (1 / (2 * np.pi * float(e.values[1])) if e.kind == "maxwell" else 0.0)
+        out.append(Candidate(replace(e, values=np.zeros(0)), 0.0, float(np.exp(x[0])) if logs else float(x[0]), frequency, _other(k)))
+    return tuple(out)
+
+
+def _other(kind: object) -> int:
+    return int(getattr(kind, "other", -1))
