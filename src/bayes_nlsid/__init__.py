@@ -34,7 +34,7 @@ _PUBLIC = {
     "fit": "identification.fit", "Fit": "identification.fit", "select": "identification.select", "Selection": "identification.select",
     "output_error": "identification.output_error",
     # posterior
-    "WhittleLikelihood": "inference.likelihood", "sample": "inference.sampling", "Posterior": "inference.posterior",
+    "WhittleLikelihood": "inference.likelihood", "sample": "inference.ensemble", "Posterior": "inference.posterior",
     # prediction
     "backbone_bands": "prediction.bands", "Bands": "prediction.bands", "heldout": "prediction.heldout", "Heldout": "prediction.heldout",
     # whole studies

@@ -144,11 +144,12 @@ class PriorEntry:
 @final
 @dataclass(frozen=True)
 class PosteriorEntry:
-    """``[posterior]``."""
+    """``[posterior]``: ``steps`` after burn-in, or None to go on until converged; ``most`` limits them, burn-in included."""
 
     likelihood: str = "whittle"
     ensembles: int = 4
-    steps: int = 2000
+    steps: int | None = None
+    most: int | None = None
     walkers: int | None = None
     priors: tuple[PriorEntry, ...] = ()
 

@@ -70,8 +70,8 @@ def plan(study: Study) -> str:
         parts.append(_wrapped(f"identification: scenario {entry.scenario}, modes {', '.join(map(str, entry.modes))}, {what}"))
         parts += [_wrapped(f"  beside it: {a.name}, {len(a.candidates)} candidate terms") for a in entry.alternatives]
     if study.posterior is not None:
-        parts.append(f"posterior: {study.posterior.ensembles} ensembles x {study.posterior.steps} steps, {study.posterior.likelihood} "
-                     f"likelihood")
+        length = "until converged" if study.posterior.steps is None else f"{study.posterior.steps} steps"
+        parts.append(f"posterior: {study.posterior.ensembles} ensembles, {length}, {study.posterior.likelihood} likelihood")
     if study.prediction is not None:
         p = study.prediction
         parts.append(f"prediction: backbone of mode {p.mode} at {p.at} from {engineering(p.amplitude, 'm')}, {p.samples} samples; "

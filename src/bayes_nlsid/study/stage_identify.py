@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.identification.fit import Fit, fit
+from bayes_nlsid.identification.fit import Fit, Start, fit
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.scenario import Scenario, scenario
 from bayes_nlsid.identification.select import Selection, select
@@ -129,7 +129,8 @@ def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData,
     except ValueError as error:
         raise InputError(f"{context.study.file.name}: [identification]", str(error), "change the candidates, joints or modes") from None
     return _record(variant.name, found, linear, selection), {"theta": found.theta, "s": found.s, "covariance": found.covariance,
-                                                             "bounds": found.problem.bounds}
+                                                             "bounds": found.problem.bounds,
+                                                             "starts": np.array([x.theta for x in found.starts])}
 
 
 def _candidates(context: Context, variant: AlternativeEntry, bare: Problem, entry: IdentificationEntry) -> list[Element]:
@@ -179,7 +180,9 @@ def stored_fit(context: Context, variant: int = 0) -> Fit:
     elements = tuple(element_from(e, context.terms) for e in record["elements"])
     problem = base_problem(context, elements)
     pick = {name: np.asarray(saved.arrays[f"{variant}.{name}"], dtype=float) for name in ("theta", "s", "covariance")}
-    return Fit(pick["theta"], pick["s"], record["mse"], pick["covariance"], record["rank"], (), record["status"], tuple(record["reasons"]),
+    starts = tuple(Start(np.asarray(at, dtype=float), entry["mse"], entry["status"], entry["evaluations"], entry["seconds"])
+                   for at, entry in zip(saved.arrays[f"{variant}.starts"], record["starts"], strict=True))
+    return Fit(pick["theta"], pick["s"], record["mse"], pick["covariance"], record["rank"], starts, record["status"], tuple(record["reasons"]),
                problem, problem.weight, context.number(f"identify {record['name']}"))
 
 

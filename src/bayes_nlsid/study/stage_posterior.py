@@ -11,10 +11,10 @@ import numpy as np
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.identification.fit import Fit
+from bayes_nlsid.inference.ensemble import MOST_STEPS, sample
 from bayes_nlsid.inference.likelihood import Likelihood, PlainLikelihood, WhittleLikelihood
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
-from bayes_nlsid.inference.sampling import sample
 from bayes_nlsid.study.context import Context, Result
 from bayes_nlsid.study.schema import PosteriorEntry
 from bayes_nlsid.study.stage_identify import stored_fit
@@ -45,7 +45,9 @@ def posterior(context: Context) -> Result:
     priors = _priors(context, entry, start)
     checkpoints = context.checkpoints("posterior")
     found = sample(start, likelihood=likelihood, priors=priors, ensembles=entry.ensembles, steps=entry.steps, walkers=entry.walkers,
-                   seed=context.number("posterior"), store=checkpoints, progress=context.progress, workers=context.workers)
+                   most=entry.most or MOST_STEPS, seed=context.number("posterior"), store=checkpoints, progress=context.progress, workers=context.workers)
+    if any("stopped from the keyboard" in reason for reason in found.reasons):
+        raise KeyboardInterrupt  # half a posterior is not a result; its checkpoints stay for the next run
     rng = np.random.default_rng(context.random("prior"))
     c = found.convergence
     arrays = {"theta": found.theta, "log_prob": found.log_prob, "quantiles": found.quantiles(), "narrowing": 1 - np.asarray(c.contraction),
@@ -100,11 +102,10 @@ def _priors(context: Context, entry: PosteriorEntry, start: Fit) -> tuple[Prior,
 
 def _keep_whole(context: Context, found: Posterior, likelihood: Likelihood, arrays: dict[str, Any]) -> None:
     """The exported data set, as bytes beside the arrays, so that ``posterior.nc`` can be written again without computing."""
-    from bayes_nlsid.inference.arviz_export import to_inference_data
+    from bayes_nlsid.inference.arviz_export import to_inference_data, write_netcdf
 
     folder = context.checkpoints("posterior")
     target = (folder if folder is not None else Path(".")) / "posterior.nc"
-    data = to_inference_data(found, likelihood)
-    data.to_netcdf(str(target))
+    write_netcdf(to_inference_data(found, likelihood), target)
     arrays["netcdf"] = np.frombuffer(target.read_bytes(), dtype=np.uint8)
     target.unlink()

@@ -82,8 +82,7 @@ starts = 20
 # params = { c = ["N/m^3", "coefficient"] }
 
 [posterior]
-ensembles = 4
-steps = 600
+ensembles = 4                     # independent ensembles of walkers; they go on until converged (or steps = ..., most = ...)
 
 [prediction]
 at = "x"                          # whose amplitude the backbone is drawn against
