@@ -42,19 +42,26 @@ def plan(cases: int, seed: int, hard: float = 0.15) -> list[Order]:
     nulls, doubles = round(0.2 * cases), round(0.12 * cases)
     classes = [c for c in catalogue.CLASSES if c != "none"] + ["other", "other"]
     deck: list[str] = []
-    while len(deck) < cases + doubles:
+    while len(deck) < 2 * (cases + doubles):
         deck += list(rng.permutation(classes))
-    strengths = [STRENGTHS[i % 4] for i in range(cases + doubles)]
-    strengths = list(rng.permutation(strengths))
+    # Every class walks through the strengths, each from its own start.
+    starts = rng.permutation(len(catalogue.CLASSES))
+    turns = {c: int(k) for c, k in zip(catalogue.CLASSES, starts, strict=True)}
+
+    def draw() -> tuple[str, float]:
+        cls = str(deck.pop())
+        turns[cls] += 1
+        return cls, STRENGTHS[turns[cls] % 4]
+
     contents: list[tuple[tuple[str, float], ...]] = []
     for i in range(cases):
         if i < nulls:
             contents.append(())
             continue
         count = 2 if i < nulls + doubles else 1
-        drawn = [(str(deck.pop()), float(strengths.pop())) for _ in range(count)]
-        if count == 2 and drawn[0][0] == drawn[1][0]:
-            drawn[1] = (str(deck.pop()), drawn[1][1])
+        drawn = [draw() for _ in range(count)]
+        while count == 2 and drawn[0][0] == drawn[1][0]:
+            drawn[1] = draw()
         contents.append(tuple(drawn))
     # Quotas within nulls and within the others alike, so that no concealment hints at an effect.
     hidden = _quota(rng, nulls, cases, 0.4)
