@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayes_nlsid.recordings.filtering import band_pass, extended, reach, skirts, without_line
+from bayes_nlsid.recordings.filtering import band_pass, continuations, reach, skirts, without_line
 
 Floats = NDArray[np.float64]
 WINDOW_DECAY = 0.3    # each local cubic reaches this far to both sides in log-amplitude
@@ -206,8 +206,8 @@ def _interpolated(x: Floats, dt: float, band: tuple[float, float], stop: tuple[f
     total = next_fast_len(n + 2 * far, real=True)
     gain = band_pass(np.fft.rfftfreq(total, dt), band, stop)
     both = []
-    for odd in (False, True):
-        spectrum = np.fft.rfft(extended(x[:, None], far, total - n - far, odd)[:, 0]) * gain
+    for longer in continuations(x[:, None], far, total - n - far, (band[0], band[1]), dt):
+        spectrum = np.fft.rfft(longer[:, 0]) * gain
         both.append(finer * np.fft.irfft(spectrum, n=finer * total)[finer * far:finer * (far + n - 1) + 1])
     return both[0], both[1]
 

@@ -53,12 +53,15 @@ def smooth_step(f: NDArray[np.float64], start: float, end: float) -> NDArray[np.
 
 def agreeing(ones: Sequence[NDArray[np.float64]], others: Sequence[NDArray[np.float64]], floor: Sequence[NDArray[np.float64]],
              most: int) -> slice:
-    """The samples where two continuations agree: to `EDGE_TOLERANCE` of the motion near that end, or a third of its noise."""
+    """The samples where two continuations agree: to `EDGE_TOLERANCE` of the motion near that end, or a third of its noise.
+
+    The motion is that of the strongest channel: one near a node of the only mode in the band has nothing to be relative to.
+    """
     n, edges = len(ones[0]), []
     for part in (slice(0, most), slice(n - 1, n - 1 - most, -1)):
         last = 0
         for one, other, noise in zip(ones, others, floor, strict=True):
-            allowed = np.maximum(EDGE_TOLERANCE * rms(one[part]), noise / 3)
+            allowed = np.maximum(EDGE_TOLERANCE * np.max(rms(one[part]), initial=0.0), noise / 3)
             beyond = np.flatnonzero((np.abs(one[part] - other[part]) > allowed).any(axis=1))
             last = max(last, int(beyond[-1]) + 1 if beyond.size else 0)
         edges.append(last)
@@ -81,6 +84,69 @@ def extended(x: NDArray[np.float64], before: int, after: int, odd: bool) -> NDAr
         part[:used] = mirror * (1 - smooth_step(np.arange(1, used + 1, dtype=float), 0.0, used + 1.0))[:, None]
         parts.append(part)
     return np.concatenate([parts[0][::-1], x, parts[1]])
+
+
+def predicted(x: NDArray[np.float64], before: int, after: int, order: int) -> NDArray[np.float64]:
+    """Continued on both sides by linear prediction from the samples near each end (Burg 1975), fading out smoothly.
+
+    A sum of lightly damped oscillations is continued almost exactly, which mirror images cannot do; the poles lie inside the unit
+    circle, so a continuation never grows.
+
+    Parameters
+    ----------
+    x : ndarray (n, s)
+    before, after : int
+        Samples to add.
+    order : int
+        Of the prediction, below n / 2; four times as many samples serve to estimate it.
+
+    Returns
+    -------
+    ndarray (before + n + after, s)
+    """
+    parts = []
+    for values, count in ((x[::-1], before), (x, after)):
+        fade = 1 - smooth_step(np.arange(1, count + 1, dtype=float), 0.0, count + 1.0)
+        tail = values[-4 * order:]
+        parts.append(np.column_stack([_prediction(column, count, order) for column in tail.T]) * fade[:, None]
+                     if x.shape[1] else np.zeros((count, 0)))
+    return np.concatenate([parts[0][::-1], x, parts[1]])
+
+
+def _prediction(x: NDArray[np.float64], count: int, order: int) -> NDArray[np.float64]:
+    """The next ``count`` samples (count,) of one signal by Burg's method."""
+    forward, backward, weights = x[1:].copy(), x[:-1].copy(), np.ones(1)
+    for _ in range(order):
+        energy = forward @ forward + backward @ backward
+        if energy <= 1e-28 * (x @ x) or len(forward) < 2:  # perfectly predictable already, or silent
+            break
+        k = -2 * (forward @ backward) / energy
+        weights = np.append(weights, 0.0) + k * np.append(weights, 0.0)[::-1]
+        forward, backward = forward[1:] + k * backward[1:], backward[:-1] + k * forward[:-1]
+    past = len(weights) - 1
+    out = np.concatenate([x[len(x) - past:], np.zeros(count)])
+    steps = -weights[:0:-1]
+    for i in range(count):
+        out[past + i] = steps @ out[i:past + i]
+    return out[past:]
+
+
+def prediction_orders(band: tuple[float, float], dt: float, n: int) -> tuple[int, int] | None:
+    """Two orders whose predictions must agree to be believed, long enough for the lower band edge; None if n samples are too few."""
+    order = min(round(2 / (band[0] * dt)) if band[0] > 0 else 0, n // 8, 600)
+    return (order, round(0.6 * order)) if order >= 8 else None
+
+
+def continuations(x: NDArray[np.float64], before: int, after: int, band: tuple[float, float], dt: float,
+                  ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two independent guesses (before + n + after, s) of what lies beyond the ends; where they differ nothing is known.
+
+    Predictions of two orders where there are samples enough, else the even and the odd mirror image.
+    """
+    orders = prediction_orders(band, dt, len(x))
+    if orders is None:
+        return extended(x, before, after, False), extended(x, before, after, True)
+    return predicted(x, before, after, orders[0]), predicted(x, before, after, orders[1])
 
 
 def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:

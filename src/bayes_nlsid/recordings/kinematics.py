@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayes_nlsid.recordings.filtering import agreeing, band_pass, extended, reach, rms, skirts, without_line
+from bayes_nlsid.recordings.filtering import agreeing, band_pass, continuations, reach, rms, skirts, without_line
 from bayes_nlsid.recordings.recording import Channel, Recording
 
 ORDER = {"displacement": 0, "velocity": 1, "acceleration": 2}
@@ -92,7 +92,7 @@ def kinematics(recording: Recording, band: tuple[float, float], fs: float | None
     ----------
     recording : Recording
         Whole steady periods (``period`` set) are transformed as they stand; anything else is treated as a transient: its straight
-        line is removed, it is continued by its faded mirror image, and edges are called invalid.
+        line is removed, it is continued by linear prediction that fades out, and edges are called invalid.
     band : tuple of float
         (low, high) Hz, 0 < low < high ≤ Nyquist frequency.
     fs : float, optional
@@ -160,7 +160,7 @@ def _filtered(response: NDArray[np.float64], force: NDArray[np.float64], order: 
 
 def _transient(recording: Recording, order: NDArray[np.int_], band: tuple[float, float], stop: tuple[float, float],
                ) -> tuple[tuple[NDArray[np.float64], ...], NDArray[np.float64], slice, NDArray[np.float64]]:
-    """Filter a transient between mirrored ends; what two different continuations disagree about is the edge effect."""
+    """Filter a transient continued beyond its ends; what two different continuations disagree about is the edge effect."""
     from scipy.fft import next_fast_len
 
     n, dt = recording.n, recording.dt
@@ -168,9 +168,9 @@ def _transient(recording: Recording, order: NDArray[np.int_], band: tuple[float,
     total = next_fast_len(n + 2 * far, real=True)
     response, force = without_line(recording.response), without_line(recording.force)
     runs = []
-    for odd in (False, True):
-        motions, filtered = _filtered(extended(response, far, total - n - far, odd), extended(force, far, total - n - far, odd),
-                                      order, dt, band, stop)
+    for one, two in zip(continuations(response, far, total - n - far, band, dt), continuations(force, far, total - n - far, band, dt),
+                        strict=True):
+        motions, filtered = _filtered(one, two, order, dt, band, stop)
         runs.append((tuple(m[far:far + n] for m in motions), filtered[far:far + n]))
     (motions, filtered), (others, other) = runs
     floor = [np.sqrt(power) for power in _noise_power(recording, order, band, stop)] + [np.zeros(force.shape[1])]
