@@ -184,3 +184,18 @@ def test_pure_noise_and_very_short_recordings_hold_no_modes() -> None:
         noise = Recording("noise", 1 / FS, rng.standard_normal((n, 3)), channels(), np.zeros((n, 0)))
         found = identify_modes(noise, model)
         assert found.modes == 0 and found.shapes.shape == (3, 0) and len(found.notes) >= 2
+
+
+def test_strongly_damped_modes_and_forced_noise() -> None:
+    model = truth([40.0, 97.0], [0.04, 0.03])
+    found = identify_modes(forced(model, 3, 0.05, True), model)
+    np.testing.assert_allclose(found.frequency, model.frequency, rtol=0.01)
+    np.testing.assert_allclose(found.zeta, model.zeta, rtol=0.1)
+    recording = forced(model, 3, 0.05, True)
+    rng = np.random.default_rng(1)
+    claimed = 0
+    for _ in range(10):
+        deaf = Recording("deaf", recording.dt, rng.standard_normal(recording.response.shape), recording.channels, recording.force,
+                         recording.inputs, period=recording.period)
+        claimed += identify_modes(deaf, model).modes
+    assert claimed <= 2

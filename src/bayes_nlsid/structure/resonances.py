@@ -67,12 +67,15 @@ def _rough_spectra(recording: Recording) -> tuple[NDArray[np.float64], Complex]:
 
 
 def _maxima(f: NDArray[np.float64], power: NDArray[np.float64], nominal: float, search: float) -> NDArray[np.int_]:
-    """Indices of lines within the search range that stand highest among their neighbours and well above the median there."""
+    """Indices of lines within the search range that stand highest among their neighbours and above the median there.
+
+    A damped mode fills the range, so its height over the median is small; what is only noise the fit will tell.
+    """
     inside = np.flatnonzero((f >= nominal * (1 - search)) & (f <= nominal * (1 + search)))
     if inside.size < 5:
         return np.zeros(0, dtype=int)
     reach = max(2, round(0.003 * nominal / (f[1] - f[0])))
-    peak = [i for i in inside if power[i] == power[max(0, i - reach):i + reach + 1].max() and power[i] > 10 * np.median(power[inside])]
+    peak = [i for i in inside if power[i] == power[max(0, i - reach):i + reach + 1].max() and power[i] > 2 * np.median(power[inside])]
     return np.array(sorted(peak, key=lambda i: -power[i])[:8], dtype=int)
 
 
