@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.forces.term import Term
+from bayes_nlsid.recordings.noise import NoiseFloor, noise_psd
 from bayes_nlsid.recordings.reading import RecordingSpec, read_recording
 from bayes_nlsid.recordings.recording import Recording
 from bayes_nlsid.structure.modal import ModalModel
@@ -83,6 +84,11 @@ class Context:
     def role(self, role: str) -> list[Recording]:
         """Recordings of one role."""
         return [self.recordings[spec.name] for spec in self.study.recordings if spec.role == role]
+
+    def noise(self, recording: Recording) -> NoiseFloor:
+        """Noise floor of a recording; a record of role ``noise`` with the same channels is the best evidence there is."""
+        reference = next((r for r in self.role("noise") if r.channels == recording.channels and r is not recording), None)
+        return noise_psd(recording, reference)
 
     @cached_property
     def model(self) -> ModalModel:

@@ -61,13 +61,28 @@ def observed(context: Context, role: str = "train") -> tuple[ModalData, ...]:
     chosen = chosen_scenario(context)
     places = tuple(dict.fromkeys([*entry.joints, *(place for e in _all_elements(entry) for place in e.locations)]))
     try:
-        return tuple(modal_data(r, model, chosen.coupled, places, band_of(context, model), fs=entry.rate,
+        return tuple(_settled(modal_data(r, model, chosen.coupled, places, band_of(context, model), noise=context.noise(r), fs=entry.rate,
                                 bands=[entry.mode_bands[entry.modes.index(k + 1)] for k in chosen.coupled] if entry.mode_bands else None,
-                                static_correction=entry.static_correction) for r in context.role(role))
+                                static_correction=entry.static_correction), entry.settle) for r in context.role(role))
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{context.study.file.name}: [identification]", str(error), "change modes, band, rate or the recordings") from None
+
+
+def _settled(data: ModalData, seconds: float) -> ModalData:
+    """The same data, whose first seconds serve the memory of the joints only.
+
+    Raises
+    ------
+    ValueError
+        If nothing is left to fit.
+    """
+    first = max(data.valid.start or 0, round(seconds / data.dt))
+    last = data.n if data.valid.stop is None else data.valid.stop
+    if first >= last - 1:
+        raise ValueError(f"settle {seconds:g} s leaves nothing of recording {data.name!r} to fit")
+    return replace(data, valid=slice(first, last))
 
 
 def _all_elements(entry: IdentificationEntry) -> list[Any]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.checks import check
-from bayes_nlsid.recordings.noise import noise_psd
 from bayes_nlsid.recordings.reading import RecordingSpec, read_recording
 from bayes_nlsid.recordings.recording import SI_UNIT, Recording
 from bayes_nlsid.study.axes import thinned
@@ -30,11 +29,9 @@ def read(context: Context) -> Result:
     """
     arrays: Arrays = {}
     records = []
-    noise_records = context.role("noise")
     for i, recording in enumerate(context.recordings.values()):
         context.progress(i / len(context.recordings), recording.name)
-        reference = next((r for r in noise_records if r.channels == recording.channels and r is not recording), None)
-        floor = noise_psd(recording, reference)
+        floor = context.noise(recording)
         arrays[f"{i}.noise_frequency"], arrays[f"{i}.noise_psd"] = floor.frequency, floor.psd
         records.append(_describe(recording, floor.rms(), floor.how))
     views = _views(context, arrays)
