@@ -45,7 +45,7 @@ class Stepper(Protocol):
 
 def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: ArrayLike | None = None, u0: ArrayLike | None = None,
              v0: ArrayLike | None = None, scheme: SchemeName = "hht", alpha: float = -0.05, keep: tuple[str, ...] = (), every: int = 1,
-             store: tuple[str, ...] = QUANTITIES, stop_amplitude: float | None = None,
+             store: tuple[str, ...] = QUANTITIES, skip: int = 0, stop_amplitude: float | None = None,
              compiled: bool | None = None, progress: Callable[[str], None] | None = None) -> Response:
     """Integrate the modal equations of motion with all elements, for all samples of theta at once.
 
@@ -72,6 +72,8 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
         Store every this many instants.
     store : tuple of str
         Quantities to store.
+    skip : int
+        Integrate this many steps before the first instant that is stored.
     stop_amplitude : float or None
         Stop once the largest displacement (m) at ``keep[0]`` over at least one period of the first mode is below this in every sample.
     compiled : bool or None
@@ -93,7 +95,7 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     -----
     The environment variable ``BAYES_NLSID_COMPILED=0`` switches compiled loops off.
     """
-    request = _request(model, theta, fs, samples, force, u0, v0, keep, every, store)
+    request = _request(model, theta, fs, samples, force, u0, v0, keep, every, store, skip)
     omega, zeta = model.linear_values(request.theta)
     same = len(omega) == 1 or bool((omega == omega[0]).all() and (zeta == zeta[0]).all())
     coefficients = steps(omega[0], zeta[0], 1 / fs, scheme, alpha) if same else steps(omega, zeta, 1 / fs, scheme, alpha)
@@ -102,7 +104,7 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     wanted = compiled if compiled is not None else samples * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
     stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None, wanted)
     window = int(np.ceil(fs / (omega.min() / (2 * np.pi)) / every)) * every
-    stored, status = _drive(request, stepper, window, stop_amplitude)
+    stored, status = _drive(request, stepper, window, stop_amplitude, skip)
     final = tuple(np.ascontiguousarray(a.T) for a in (stepper.displacement, stepper.velocity))
     return Response(every / fs, request.keep, *stored, status=status, iterations=stepper.iterations.copy(), unconverged=stepper.failures.copy(),
                     scheme=scheme, period_error=period_error, false_damping=false_damping, final_displacement=final[0],
@@ -136,7 +138,7 @@ class _Request:
 
 
 def _request(model: Model, theta: ArrayLike, fs: float, samples: int, force: ArrayLike | None, u0: ArrayLike | None, v0: ArrayLike | None,
-             keep: tuple[str, ...], every: int, store: tuple[str, ...]) -> _Request:
+             keep: tuple[str, ...], every: int, store: tuple[str, ...], skip: int) -> _Request:
     values = np.atleast_2d(np.asarray(theta, dtype=float))
     if values.ndim != 2 or values.shape[1] != model.size:
         raise ValueError(f"theta has shape {values.shape}, expected (S, {model.size}): {', '.join(model.names)}")
@@ -144,8 +146,8 @@ def _request(model: Model, theta: ArrayLike, fs: float, samples: int, force: Arr
         raise ValueError("theta holds NaN or infinite values")
     if not (np.isfinite(fs) and fs > 0):
         raise ValueError(f"fs must be a positive number of Hz, got {fs}")
-    if samples < 2 or every < 1:
-        raise ValueError(f"samples must be at least 2 and every at least 1, got {samples} and {every}")
+    if samples < 2 or every < 1 or not 0 <= skip < samples:
+        raise ValueError(f"samples must be at least 2, every at least 1 and skip from 0 below samples, got {samples}, {every} and {skip}")
     unknown = set(store) - set(QUANTITIES)
     if unknown or not store:
         raise ValueError(f"store must name some of {QUANTITIES}, got {store}")
@@ -189,7 +191,8 @@ def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, 
     return NumpyStepper(coefficients, joints, *start), False
 
 
-def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: float | None) -> tuple[list[Array], NDArray[np.str_]]:
+def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: float | None,
+           skip: int) -> tuple[list[Array], NDArray[np.str_]]:
     """Run block by block: store, watch for divergence, stop at the floor. Returns the three quantities (S, n, L) and the status (S,)."""
     rows, every = request.rows, request.every
     count, locations = request.theta.shape[0], len(request.keep)
@@ -197,12 +200,16 @@ def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: flo
     block = max(every, min(4096, BLOCK_BYTES // per_step) // every * every)
     if stop_amplitude is not None:
         block = max(block, window)
+    done = 0
+    while done < skip:
+        size = min(block, skip - done)
+        stepper.advance(size, request.modal_force(done + 1, done + size + 1), rows, every, (None, None, None))
+        done += size
     blocks: list[list[Array]] = [[], [], []]
     for i, name in enumerate(QUANTITIES):
         if name in request.store:
             blocks[i].append((rows @ getattr(stepper, name))[None])
     status = np.full(count, "ok", dtype="<U8")
-    done = 0
     while done < request.samples - 1:
         size = min(block, request.samples - 1 - done)
         kept = size // every
