@@ -21,7 +21,7 @@ from bayes_nlsid.inference import convergence as cv
 from bayes_nlsid.inference.likelihood import GaussianResidual, PlainLikelihood, WhittleLikelihood, frequency_blocks, laplace
 from bayes_nlsid.inference.posterior import Posterior, load
 from bayes_nlsid.inference.prior import Prior, check_priors, default_priors, log_prior
-from bayes_nlsid.inference.target import Target, pack, prior_spread, unpack
+from bayes_nlsid.inference.target import Target, pack, unpack
 from bayes_nlsid.model import Element, Model
 from tests.identification.truth import beam, pack as modal, prescribed
 from tests.inference.targets import lend, run
@@ -70,7 +70,7 @@ def test_prior_in_search_coordinates_integrates_to_one(c):
     priors = default_priors(problem)
     low, high = problem.to_s(problem.bounds.T)[:, 0]
     s = np.linspace(low, high, 400_001)
-    assert np.trapezoid(np.exp(log_prior(problem, priors, s[:, None])), s) == pytest.approx(1.0, rel=1e-4)
+    assert np.trapezoid(np.exp(log_prior(problem.coordinates, priors, s[:, None])), s) == pytest.approx(1.0, rel=1e-4)
 
 
 def test_default_priors_say_what_the_modal_test_knew():
@@ -135,7 +135,7 @@ def test_a_failing_law_is_impossible_not_an_error():
     problem = Problem(Model(beam(), (Element(broken, ("J1",)),)), (run(),), scenario("S2", 3, 0))
     likelihood = WhittleLikelihood(fit(problem, starts=6))
     target = Target(likelihood, default_priors(problem))
-    value, failed = target.parts(problem.to_s(np.array([[-1e5], [1e5]])))
+    value, failed = target.parts(target.to_s(np.array([[-1e5], [1e5]])))
     assert value[0] == -np.inf and np.isfinite(value[1]) and failed.tolist() == [True, False]
 
 
@@ -166,7 +166,7 @@ def test_whittle_covers_under_sensor_noise_and_plain_does_not_know():
         problem = Problem(Model(beam(1, 1), (), (0,)), (coloured(seed),), scenario("S1", 1, 0))
         start = fit(problem)
         whittle = WhittleLikelihood(start)
-        spread = prior_spread(problem, default_priors(problem))
+        spread = Target(whittle, default_priors(problem), problem.coordinates).prior_sd
         sd = np.sqrt(np.diag(laplace(whittle, whittle.fit.theta, spread)))
         z.append((whittle.fit.s - problem.to_s(np.array([20.0, 0.01]))) / sd)
         with warnings.catch_warnings():
@@ -288,5 +288,5 @@ def test_draws_and_quantiles():
 
 def test_a_target_travels_to_another_process():
     target = Target(WhittleLikelihood(lend(2)), default_priors(lend(2).problem))
-    s = target.problem.to_s(lend(2).theta)[None]
+    s = target.to_s(lend(2).theta)[None]
     assert np.array_equal(unpack(pack(target))(s), target(s))

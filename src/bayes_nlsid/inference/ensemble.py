@@ -29,7 +29,7 @@ from bayes_nlsid.inference.likelihood import Likelihood, WhittleLikelihood
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
 from bayes_nlsid.inference.starting import centres, first_walkers, starting_fits
-from bayes_nlsid.inference.target import Target, pack, prior_spread, unpack
+from bayes_nlsid.inference.target import Target, pack, unpack
 
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
 KEEP_FAILED = 20   # failed points remembered per block
@@ -93,8 +93,15 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
 
     count, where = [0], []
 
+    interrupted = [False]
+
     def density(s: Array) -> Array:
-        value, failed = target.parts(s)
+        # emcee prints what it catches; an interruption waits for the end of a block that is then thrown away.
+        try:
+            value, failed = target.parts(s) if not interrupted[0] else (np.full(len(s), -np.inf), np.zeros(len(s), dtype=bool))
+        except KeyboardInterrupt:
+            interrupted[0] = True
+            return np.full(len(s), -np.inf)
         count[0] += int(failed.sum())
         if failed.any() and len(where) < KEEP_FAILED:
             where.extend(s[failed])
@@ -104,8 +111,10 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
     sampler = emcee.EnsembleSampler(walkers, dimensions, density, moves=moves(), vectorize=True)
     state = emcee.State(start.s, log_prob=start.log_prob, random_state=start.random)
     end = sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
+    if interrupted[0]:
+        raise KeyboardInterrupt
     final_state = Walkers(np.array(end.coords), np.array(end.log_prob), tuple(sampler.random_state))
-    failed_at = target.problem.to_theta(np.array(where[:KEEP_FAILED])) if where else np.zeros((0, dimensions))
+    failed_at = target.to_theta(np.array(where[:KEEP_FAILED])) if where else np.zeros((0, dimensions))
     return Block(np.array(sampler.get_chain()), np.array(sampler.get_log_prob()), np.asarray(sampler.backend.accepted, dtype=float),
                  final_state, count[0], failed_at)
 
@@ -255,7 +264,7 @@ class _Run:
     def _burn_in(self, states: list[Walkers]) -> list[Walkers]:
         """Re-draw lost walkers; decide whether burn-in is over."""
         done = len(self.blocks) * self.block
-        longest = self.most // 4 if self.steps is None else max(LEAST_BURN, min(self.steps, self.most // 2))
+        longest = self.most // 4 if self.steps is None else min(max(LEAST_BURN, self.steps), self.most // 2)
         half = self._chain(len(self.blocks) // 2)[0]
         tau = max(integrated_time(half[..., i]) for i in range(half.shape[-1]))
         if (done >= LEAST_BURN and done >= BURN_TIMES * tau) or done + self.block > longest:
@@ -287,7 +296,7 @@ class _Run:
     def _assess(self, s: Array, value: Array, accepted: Array) -> Convergence:
         problem = self.target.problem
         return assess(s, value, accepted, names=problem.names, nonlinear=[p.param is not None for p in problem.model.parameters],
-                      prior_sd=prior_spread(problem, self.target.priors), box=self.target.box, redrawn=self.redrawn, stopped=self.stopped)
+                      prior_sd=self.target.prior_sd, box=self.target.box, redrawn=self.redrawn, stopped=self.stopped)
 
     def _tell(self) -> None:
         if self.progress is None:
@@ -317,7 +326,7 @@ class _Run:
         failed = [b.failed_at for row in self.blocks for b in row if len(b.failed_at)]
         if self.progress is not None:
             self.progress(1.0, f"{convergence.status}: {s.shape[1]} steps of {s.shape[0]} ensembles after {first * self.block} of burn-in")
-        return Posterior(problem.names, tuple(p.unit for p in problem.model.parameters), problem.to_theta(s[:, thin - 1::thin]),
+        return Posterior(problem.names, tuple(p.unit for p in problem.model.parameters), self.target.to_theta(s[:, thin - 1::thin]),
                          value[:, thin - 1::thin], convergence, priors, seed, self.target.likelihood.describe(), first * self.block,
                          sum(b.failures for row in self.blocks for b in row),
                          np.concatenate(failed)[:KEEP_FAILED] if failed else np.zeros((0, len(priors))))

@@ -15,6 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.elimination import jacobian
 from bayes_nlsid.identification.fit import Fit, fit
 from bayes_nlsid.identification.noise import WIDTH, freedom, smoothed_variance
@@ -294,9 +295,16 @@ def _gaussian(problem: Problem, variance: NDArray[np.float64], theta: NDArray[np
     return GaussianResidual(problem, variance, theta, frequency_blocks(problem)[0])
 
 
-def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance (P, P) in s around theta: information of the likelihood plus that of the prior, 1/sd² in s (P,), so that it always exists."""
-    slope = jacobian(likelihood.problem, theta) * np.sqrt(likelihood.weights)[:, None]
+def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64], coordinates: Coordinates | None = None) -> NDArray[np.float64]:
+    """Covariance (P, P) around theta: information of the likelihood plus that of the prior, 1/sd² (P,), so that it always exists.
+
+    In the given coordinates, None: those of the problem; ``prior_sd`` must be in the same.
+    """
+    problem = likelihood.problem
+    slope = jacobian(problem, theta) * np.sqrt(likelihood.weights)[:, None]
+    if coordinates is not None:
+        stretch = coordinates.log_jacobian(coordinates.to_s(theta)) - problem.coordinates.log_jacobian(problem.to_s(theta))
+        slope = slope * np.exp(stretch)
     slope = np.where(np.isfinite(slope), slope, 0.0) * prior_sd
     values, vectors = np.linalg.eigh(slope.T @ slope)
     return (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T * np.outer(prior_sd, prior_sd)

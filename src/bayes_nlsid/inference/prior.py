@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, log_ndtr, logit, ndtr, ndtri
 
+from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.problem import Problem
 
 Kind = Literal["normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal"]
@@ -63,7 +65,7 @@ class Prior:
             raise ValueError(f"prior of {self.name!r}: halfnormal needs a lower bound of at least 0, got {self.lower}")
         if not self.b > 0:
             raise ValueError(f"prior of {self.name!r}: b must be positive, got {self.b}")
-        low, high = self._edges()
+        low, high = self._edges
         if self.kind not in ("uniform", "loguniform") and ndtr(high) - ndtr(low) < 1e-12 and log_ndtr(-abs(low)) < -30:
             raise ValueError(f"prior of {self.name!r}: almost all of it lies outside its bounds [{self.lower}, {self.upper}]")
 
@@ -81,22 +83,29 @@ class Prior:
                     return (logit((p - self.lower) / (self.upper - self.lower)) - self.a) / self.b
         return p
 
+    @cached_property
     def _edges(self) -> tuple[float, float]:
         low, high = self._forward(np.array([self.lower, self.upper]))
         return float(low), float(high)
+
+    @cached_property
+    def _constant(self) -> float:
+        """Logarithm of what normalises the density in the standardised variable."""
+        low, high = self._edges
+        if self.kind in ("uniform", "loguniform"):
+            return float(-np.log(high - low))
+        return float(-0.5 * np.log(2 * np.pi) - np.log(self.b) - _log_mass(low, high))
 
     def log_density(self, p: ArrayLike) -> Array:
         """Natural logarithm of the density, 1/unit; −inf outside the bounds."""
         values = np.asarray(p, dtype=float)
         inside = (values >= self.lower) & (values <= self.upper)
         safe = np.where(inside, values, 0.5 * (self.lower + self.upper))
-        low, high = self._edges()
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = self._forward(safe)
             if self.kind in ("uniform", "loguniform"):
-                log = np.full(values.shape, -np.log(high - low))
+                log = np.full(values.shape, self._constant)
             else:
-                log = -0.5 * z**2 - 0.5 * np.log(2 * np.pi) - np.log(self.b) - _log_mass(low, high)
+                log = self._constant - 0.5 * self._forward(safe) ** 2
             if self.kind in ("lognormal", "loguniform"):
                 log = log - np.log(safe)
             if self.kind == "logitnormal":
@@ -106,7 +115,7 @@ class Prior:
     def quantile(self, probability: ArrayLike) -> Array:
         """Parameter value below which the given share of the prior lies."""
         share = np.asarray(probability, dtype=float)
-        low, high = self._edges()
+        low, high = self._edges
         if self.kind in ("uniform", "loguniform"):
             z = low + share * (high - low)
         elif low > 0:     # work in the far tail where the normal distribution has digits
@@ -182,12 +191,25 @@ def check_priors(problem: Problem, priors: Sequence[Prior]) -> tuple[Prior, ...]
     return tuple(named[name] for name in problem.names)
 
 
-def log_prior(problem: Problem, priors: Sequence[Prior], s: ArrayLike) -> Array:
-    """Log density (...) of search coordinates s (..., P): priors of theta plus log |dtheta/ds|."""
+def log_prior(coordinates: Coordinates, priors: Sequence[Prior], s: ArrayLike, theta: Array | None = None) -> Array:
+    """Log density (...) of search coordinates s (..., P): priors of theta plus log |dtheta/ds|. ``theta`` saves working it out again."""
     values = np.asarray(s, dtype=float)
-    theta = problem.to_theta(values)
-    # Rounding on the way back from s must not throw a point out that sits on its bound.
-    low, high = problem.bounds.T
-    theta = np.where(np.abs(theta - low) <= 1e-12 * np.abs(low), low, np.where(np.abs(theta - high) <= 1e-12 * np.abs(high), high, theta))
-    density = np.stack([prior.log_density(theta[..., i]) for i, prior in enumerate(priors)], axis=-1) if priors else np.zeros((*values.shape,))
-    return np.asarray(np.sum(density + problem.coordinates.log_jacobian(values), axis=-1))
+    physical = coordinates.to_theta(values) if theta is None else theta
+    out = np.sum(coordinates.log_jacobian(values), axis=-1)
+    for i, prior in enumerate(priors):
+        p = physical[..., i]
+        # Rounding on the way back from s must not throw a point out that sits on its bound.
+        slack = 1e-12 * (prior.upper - prior.lower)
+        inside = (p >= prior.lower - slack) & (p <= prior.upper + slack)
+        out = out + np.where(inside, prior.log_density(np.clip(p, prior.lower, prior.upper)), -np.inf)
+    return np.asarray(out)
+
+
+def sampling_coordinates(problem: Problem, priors: Sequence[Prior]) -> Coordinates:
+    """Coordinates to sample in: those of the problem, but with c of a signed parameter at least the standard deviation of its prior.
+
+    The posterior does not depend on c, the sampler does: with a small c a coefficient that may be zero has two branches, many decades of
+    emptiness apart, where in these coordinates it is one bell.
+    """
+    wide = np.array([float(p.quantile((np.arange(256) + 0.5) / 256).std()) for p in priors])
+    return Coordinates(np.where(problem.scale > 0, np.maximum(problem.scale, wide), 0.0))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.identification.fit import Fit
 from bayes_nlsid.inference.likelihood import Likelihood, laplace
-from bayes_nlsid.inference.target import Target, prior_spread
+from bayes_nlsid.inference.target import Target
 
 Array = NDArray[np.float64]
 DEPTH = 30.0   # log units (plus P) below the best optimum at which another is not worth a walker
@@ -20,7 +20,7 @@ def centres(target: Target, fits: tuple[Fit, ...]) -> Array:
     for found in fits:
         for theta in (found.theta, *(x.theta for x in found.optima())):
             if np.isfinite(theta).all():
-                points.append(_inside(target, target.problem.to_s(theta)))
+                points.append(_inside(target, target.to_s(theta)))
     if not points:
         return np.zeros((0, len(target.priors)))
     s = np.array(points)
@@ -52,8 +52,8 @@ def first_walkers(target: Target, middle: Array, count: int, seeds: list[np.rand
     InputError
         If no finite log density is found.
     """
-    spread = prior_spread(target.problem, target.priors)
-    roots = [_root(laplace(target.likelihood, target.problem.to_theta(s), spread)) for s in middle]
+    spread = target.prior_sd
+    roots = [_root(laplace(target.likelihood, target.to_theta(s), spread, target.coordinates)) for s in middle]
     out = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -61,7 +61,7 @@ def first_walkers(target: Target, middle: Array, count: int, seeds: list[np.rand
             which = rng.integers(len(middle), size=count)
             s = _scatter(target, middle[which], np.array(roots)[which], rng)
         else:
-            s = target.problem.to_s(np.stack([p.sample(count, rng) for p in target.priors], axis=-1))
+            s = target.to_s(np.stack([p.sample(count, rng) for p in target.priors], axis=-1))
         value = target(s)
         if not np.isfinite(value).any():
             raise InputError("sampling", "no point near the fit has a finite posterior density", "check bounds, priors and force laws")

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bayes_nlsid.forces.library import LIBRARY, find_term
 from bayes_nlsid.forces.term import Term
+from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.inference.likelihood import Likelihood
-from bayes_nlsid.inference.prior import Prior, check_priors, log_prior
+from bayes_nlsid.inference.prior import Prior, check_priors, log_prior, sampling_coordinates
 
 
 @final
@@ -28,33 +28,51 @@ class Target:
     likelihood : Likelihood
     priors : tuple of Prior
         In the order of theta.
+    coordinates : Coordinates or None
+        None takes ``sampling_coordinates``.
     """
 
     likelihood: Likelihood
     priors: tuple[Prior, ...]
+    coordinates: Coordinates = field(default=None, repr=False)  # type: ignore[assignment]
     box: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "priors", check_priors(self.problem, self.priors))
+        if self.coordinates is None:
+            object.__setattr__(self, "coordinates", sampling_coordinates(self.problem, self.priors))
         support = np.array([[p.lower for p in self.priors], [p.upper for p in self.priors]]).reshape(2, len(self.priors))
-        object.__setattr__(self, "box", self.problem.to_s(np.clip(support, *self.problem.bounds.T)))
+        object.__setattr__(self, "box", self.to_s(np.clip(support, *self.problem.bounds.T)))
 
     @property
     def problem(self) -> Problem:
         """Bounds, coordinates and names."""
         return self.likelihood.problem
 
+    def to_s(self, theta: ArrayLike) -> NDArray[np.float64]:
+        """Sampling coordinates (..., P)."""
+        return self.coordinates.to_s(theta)
+
+    def to_theta(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Physical parameters (..., P)."""
+        return self.coordinates.to_theta(s)
+
+    @property
+    def prior_sd(self) -> NDArray[np.float64]:
+        """Standard deviation (P,) of each prior in sampling coordinates, from its quantiles."""
+        shares = (np.arange(512) + 0.5) / 512
+        return self.to_s(np.stack([p.quantile(shares) for p in self.priors], axis=-1)).std(axis=0)
+
     def parts(self, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Log density (W,) of s (W, P), and where the likelihood failed although the prior allows the point."""
         out = np.full(len(s), -np.inf)
         failed = np.zeros(len(s), dtype=bool)
         inside = ((s >= self.box[0]) & (s <= self.box[1])).all(axis=1)
-        prior = np.full(len(s), -np.inf)
-        if inside.any():
-            prior[inside] = log_prior(self.problem, self.priors, s[inside])
+        theta = self.to_theta(np.clip(s, *self.box))
+        prior = np.where(inside, log_prior(self.coordinates, self.priors, np.clip(s, *self.box), theta), -np.inf)
         allowed = np.isfinite(prior)
         if allowed.any():
-            value = self.likelihood.log_likelihood(self.problem.to_theta(s[allowed]))
+            value = self.likelihood.log_likelihood(theta[allowed])
             failed[allowed] = ~np.isfinite(value)
             out[allowed] = np.where(np.isfinite(value), prior[allowed] + value, -np.inf)
         return out, failed
@@ -62,12 +80,6 @@ class Target:
     def __call__(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log density (W,) of s (W, P)."""
         return self.parts(np.asarray(s, dtype=float))[0]
-
-
-def prior_spread(problem: Problem, priors: Sequence[Prior], points: int = 512) -> NDArray[np.float64]:
-    """Standard deviation (P,) of each prior in search coordinates, from its quantiles."""
-    shares = (np.arange(points) + 0.5) / points
-    return problem.to_s(np.stack([p.quantile(shares) for p in priors], axis=-1)).std(axis=0)
 
 
 class _Pickler(pickle.Pickler):
