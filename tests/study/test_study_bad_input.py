@@ -49,7 +49,7 @@ CASES = {
     "band backwards": ('band = ["5 Hz", "45 Hz"]', 'band = ["45 Hz", "5 Hz"]', ["band", "lower to a higher"]),
     "no starts": ("starts = 20", "starts = 0", ["starts", "out of range"]),
     "one ensemble": ("ensembles = 4", "ensembles = 1", ["[posterior] ensembles", "out of range"]),
-    "amplitude in hertz": ('amplitude = "4 mm"', 'amplitude = "4 Hz"', ["[prediction] amplitude", "Hz"]),
+    "amplitude in hertz": ('amplitude = "2 mm"', 'amplitude = "2 Hz"', ["[prediction] amplitude", "Hz"]),
     "held out unknown": ('heldout = ["later part"]', 'heldout = ["last part"]', ["heldout", "no recording 'last part'", "'later part'"]),
     "no structure": ("[structure] ", "[structures] ", ["[structure]", "is missing"]),
     "not TOML": ("seed = 1", "seed = = 1", ["is not valid TOML", "line 5"]),
@@ -65,7 +65,7 @@ CASES = {
 
 
 def write(folder: Path, text: str) -> Path:
-    np.savez(folder / "recording.npz", acceleration=np.zeros(8), force=np.zeros(8), fs=100.0)
+    np.savez(folder / "recording.npz", acceleration=np.zeros(8), force=np.zeros(8), quiet=np.zeros(8), fs=100.0)
     path = folder / "study.toml"
     path.write_text(text, encoding="utf-8")
     return path
