@@ -218,7 +218,7 @@ def _initial_state(model: Model, theta: Array, recording: Recording, band: tuple
         u[:, active], v[:, active] = x[:, :count], x[:, count:] * omega
         found = predict_record(model, np.broadcast_to(parameters, (len(x), theta.shape[1])), window, u0=u, v0=v, substeps=substeps,
                                **keywords)  # type: ignore[arg-type]
-        return np.nan_to_num((found.values * weight).reshape(len(x), -1), nan=1e6), found.substeps
+        return (found.values * weight).reshape(len(x), -1), found.substeps
 
     x = np.zeros((len(theta), 2 * count))
     small = 1e-9
@@ -232,7 +232,11 @@ def _initial_state(model: Model, theta: Array, recording: Recording, band: tuple
         jacobian = ((moved[1:] - moved[0]) / size).T
         column = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         residual = measured - run(theta, x, substeps)[0]
-        change = np.linalg.lstsq(jacobian / column, residual.T, rcond=1e-6)[0].T / column
+        # a draw whose motion diverges keeps the state it has: it will be counted as diverged
+        lost = ~np.isfinite(residual).all(axis=1)
+        if not np.isfinite(jacobian).all():
+            break
+        change = np.linalg.lstsq(jacobian / column, np.where(lost, 0.0, residual.T), rcond=1e-6)[0].T / column
         x = x + change
         if np.abs(change).max() <= 1e-7 * np.abs(x).max():
             break

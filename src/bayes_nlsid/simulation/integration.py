@@ -188,7 +188,8 @@ def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, 
             if progress is not None:
                 progress("compiled time loop: the first run on a computer compiles it, which can take a minute")
             return CompiledStepper(coefficients, joints, known, *start), True
-    return NumpyStepper(coefficients, joints, *start), False
+    with np.errstate(over="ignore", invalid="ignore"):
+        return NumpyStepper(coefficients, joints, *start), False
 
 
 def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: float | None,
