@@ -194,8 +194,8 @@ def test_strongly_damped_modes_and_forced_noise() -> None:
     recording = forced(model, 3, 0.05, True)
     rng = np.random.default_rng(1)
     claimed = 0
-    for _ in range(10):
+    for _ in range(3):
         deaf = Recording("deaf", recording.dt, rng.standard_normal(recording.response.shape), recording.channels, recording.force,
                          recording.inputs, period=recording.period)
         claimed += identify_modes(deaf, model).modes
-    assert claimed <= 2
+    assert claimed <= 1
