@@ -60,9 +60,9 @@ def envelope(time: Array, signal: Array, columns: int = 1500) -> tuple[Array, Ar
     n = len(signal)
     if n <= 2 * columns:
         return time, signal, signal
-    size = n // columns
-    cut = signal[:size * columns].reshape(columns, size)
-    return time[:size * columns:size], cut.min(axis=1), cut.max(axis=1)
+    size = -(-n // columns)
+    starts = np.arange(0, n, size)
+    return time[starts], np.minimum.reduceat(signal, starts), np.maximum.reduceat(signal, starts)
 
 
 def draw_signal(axes: Axes, time: Array, signal: Array, **style: Any) -> None:

@@ -54,7 +54,8 @@ def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mappin
     left.set_yscale("log")
     left.set(xticks=at, xlabel="step", ylabel="mean square residual")
     left.set_xticklabels(labels, rotation=30 if len(labels) > 3 else 0, ha="right" if len(labels) > 3 else "center")
-    left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handletextpad=0.3, columnspacing=0.8)
+    if left.get_legend_handles_labels()[0]:
+        left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handletextpad=0.3, columnspacing=0.8)
     _first_ranking(right, tried, floor, linear)
     return figure
 

@@ -41,7 +41,10 @@ def joint_loops(loops: Sequence[Mapping[str, object]]) -> Figure:
         energy = np.abs(np.sum(0.5 * (force + np.roll(force, -1, axis=1)) * (np.roll(q, -1) - q), axis=1))
         low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95])
         fe, ue = prefixed(high, "J")
-        axes.set_title(f"{loops[i]['location']}\nenergy per cycle {fe * middle:.2g} ({fe * low:.2g}–{fe * high:.2g}) {ue}", fontsize=8)
+        lost = f"energy per cycle {fe * middle:.2g} ({fe * low:.2g}–{fe * high:.2g}) {ue}"
+        if high < 1e-6 * float(np.abs(force).max() * np.abs(q).max()):
+            lost = "no energy lost"
+        axes.set_title(f"{loops[i]['location']}, {loops[i].get('term', '')}\n{lost}".replace(", \n", "\n"), fontsize=8)
         axes.set(xlabel=f"relative displacement ({uq})", ylabel=f"force beyond the linear model ({uf})" if i % columns == 0 else f"({uf})")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=2)
@@ -71,9 +74,11 @@ def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | N
     everything = [bands["amplitude"], *([measured["amplitude"]] if measured else [])]
     fa, ua = prefixed(np.nanmax(np.concatenate(everything)), "m")
     for axes, key, factor in ((left, "frequency", 1.0), (right, "damping", 100.0)):
-        axes.fill_between(fa * bands["amplitude"], factor * bands[f"{key}_q05"], factor * bands[f"{key}_q95"], color=BLUE, alpha=0.28,
-                          linewidth=0, label=f"model, {BAND}")
-        axes.plot(fa * bands["amplitude"], factor * bands[f"{key}_q50"], color=BLUE, label="model, median")
+        low, high = factor * bands[f"{key}_q05"], factor * bands[f"{key}_q95"]
+        spread = not np.array_equal(low, high, equal_nan=True)
+        if spread:
+            axes.fill_between(fa * bands["amplitude"], low, high, color=BLUE, alpha=0.28, linewidth=0, label=f"model, {BAND}")
+        axes.plot(fa * bands["amplitude"], factor * bands[f"{key}_q50"], color=BLUE, label="model, median" if spread else "model, best fit")
         for k, rival in enumerate(alternatives):
             axes.plot(fa * np.asarray(rival["amplitude"]), factor * np.asarray(rival[key]), linestyle=("--", ":", "-.")[k % 3],
                       color=(GREEN, ORANGE, GREY)[k % 3], label=f"{rival['name']} (fit)")
@@ -132,11 +137,15 @@ def heldout_overlay(time: Array, measured: Array, low: Array, middle: Array, hig
     sign = sign or unit_sign(unit)
     whole, error = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
     draw_signal(whole, time, factor * measured, color=GREY, label="measured")
-    t, bottom, top = envelope(time, factor * middle, columns=250)  # each stretch spans a few cycles
-    whole.plot(t, top, color=BLUE, linewidth=1.0, label="predicted, median (extremes)")
-    whole.plot(t, bottom, color=BLUE, linewidth=1.0)
+    stretches = int((time[-1] - time[0]) / (zoom / 4))  # each spans more than a cycle, so extremes follow the amplitude
+    if stretches >= 60:
+        t, bottom, top = envelope(time, factor * middle, columns=stretches)
+        whole.plot(t, top, color=BLUE, linewidth=1.0, label="predicted (extremes)")
+        whole.plot(t, bottom, color=BLUE, linewidth=1.0)
+    else:
+        whole.plot(time, factor * middle, color=BLUE, linewidth=0.8, label="predicted")
     whole.set(ylabel=sign, xlim=(time[0], time[-1]))
-    whole.set_title(f"{channel}   {facts}", fontsize=8.5)
+    figure.suptitle(f"{channel}   {facts}", x=0.01, ha="left", fontsize=8.5)
     lines, words = whole.get_legend_handles_labels()
     for k, centre in enumerate(np.array([0.03, 0.35, 0.8]) * (time[-1] - time[0]) + time[0]):
         axes = figure.add_subplot(grid[1, k])
@@ -152,7 +161,7 @@ def heldout_overlay(time: Array, measured: Array, low: Array, middle: Array, hig
         if k == 0:
             close, names = axes.get_legend_handles_labels()
             lines, words = lines + close[:1] + close[2:], words + names[:1] + [names[2] + " (close-ups)"]
-    whole.legend(lines, words, loc="upper right", ncols=2)
+    whole.legend(lines, words, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, columnspacing=1.0)
     draw_signal(error, time, factor * (measured - middle), color=RED)
     if noise > 0:
         error.axhspan(-1.65 * factor * noise, 1.65 * factor * noise, color=GREEN, alpha=0.25, linewidth=0, label="sensor noise, 90 %")
