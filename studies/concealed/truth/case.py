@@ -117,11 +117,7 @@ def make(order: Order, seed: int) -> Made:
     scenery = draw_scenery(rng, sensors, order.conceal == "hidden_joint", order.conceal == "loose_prior")
     campaign = draw_campaign(rng, order.conceal == "one_level", order.burst_only)
     bench = _bench(scenery, campaign, sensors, int(rng.integers(2**62)))
-    hidden = tuple(j for j in bench.joints if j.startswith("J"))
-    effects: tuple[Effect, ...] = ()
-    for cls, target in order.effects:
-        effects += (draw_effect(cls, target, bench, rng, order.conceal, hidden, tuple(e.loc for e in effects)),)
-    truth = truth_of(bench, effects)
+    effects, truth, clean = _recorded(order, bench, campaign, rng)
     noise_rel = float(rng.uniform(0.05, 0.15) if order.conceal == "noise" else rng.uniform(0.0025, 0.01))
     quality = np.exp(0.15 * rng.standard_normal(sensors)) * np.where(rng.random(sensors) < 0.15, rng.uniform(2, 4, sensors), 1.0)
     noise = NoiseModel(
@@ -131,12 +127,26 @@ def make(order: Order, seed: int) -> Made:
         float(10 ** rng.uniform(-3.3, -2.7)) * campaign.rms,
         int(rng.integers(2**62)),
     )
-    clean = {e.name: truth.clean(campaign, e) for e in campaign.entries}
     plain = Truth(bench.plant, (), (), sensors, 0)
     baseline = {e.name: plain.clean(campaign, e) for e in campaign.entries} if effects else clean
     noisy = {e.name: noise.add(clean[e.name][1], clean[e.name][0], i)[::-1] for i, e in enumerate(campaign.entries)}
     nominal = assemble(scenery.nominal, scenery.nominal_mesh)
     return Made(name, order, scenery, nominal, bench, campaign, effects, truth, noise, noise_rel, clean, noisy, baseline)
+
+
+def _recorded(order: Order, bench: Bench, campaign: Campaign, rng: np.random.Generator):
+    """Tuned effects, the truth with them and its noise-free records; targets are halved while a record cannot be computed."""
+    hidden = tuple(j for j in bench.joints if j.startswith("J"))
+    for halvings in range(4):
+        effects: tuple[Effect, ...] = ()
+        for cls, target in order.effects:
+            effects += (draw_effect(cls, target / 2**halvings, bench, rng, order.conceal, hidden, tuple(e.loc for e in effects)),)
+        truth = truth_of(bench, effects)
+        try:
+            return effects, truth, {e.name: truth.clean(campaign, e) for e in campaign.entries}
+        except FloatingPointError:
+            continue
+    raise FloatingPointError(f"case {order.index}: no drawn effect could be simulated; use another seed")
 
 
 def _bench(scenery: Scenery, campaign: Campaign, sensors: int, seed: int) -> Bench:

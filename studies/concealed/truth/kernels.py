@@ -220,22 +220,50 @@ def _solve_local(free_d, free_v, cross_d, cross_v, kinds, params, modulation, h,
                 if j != i:
                     d += cross_d[i, j] * now[j]
                     v += cross_v[i, j] * now[j]
-            a = now[i]
-            ra = a + law(kinds[i], params[i], d + cross_d[i, i] * a, v + cross_v[i, i] * a, modulation[i], h, old[i], new[i])
-            b = a - ra
-            rb = 0.0
-            for _ in range(40):
-                rb = b + law(kinds[i], params[i], d + cross_d[i, i] * b, v + cross_v[i, i] * b, modulation[i], h, old[i], new[i])
-                if abs(rb) <= tolerance + 1e-9 * abs(b) or rb == ra:
-                    break
-                slope = (rb - ra) / (b - a)
-                # The local equation rises with slope at least about one for a stable law; a smaller secant is not trusted.
-                step = rb / max(slope, 0.5)
-                a, ra = b, rb
-                b = b - step
+            b, rb = _solve_one(now[i], d, v, cross_d[i, i], cross_v[i, i], kinds[i], params[i], modulation[i], h, old[i], new[i], tolerance)
             change = max(change, abs(b - now[i]))
             now[i] = b
             left = max(left, abs(rb))
         if change <= 10 * tolerance:
             break
     return left
+
+
+@numba.njit(cache=True)
+def _solve_one(a, d, v, cd, cv, kind, p, modulation, h, old, new, tolerance):
+    """Root of ``f + law(d + cd f, v + cv f)``: secant, then bisection where the law has corners.  Returns the force and its residual."""
+    start = a
+    ra = a + law(kind, p, d + cd * a, v + cv * a, modulation, h, old, new)
+    start_r = ra
+    b = a - ra
+    rb = 0.0
+    for _ in range(25):
+        rb = b + law(kind, p, d + cd * b, v + cv * b, modulation, h, old, new)
+        if abs(rb) <= tolerance + 1e-9 * abs(b):
+            return b, rb
+        if b == a:
+            break
+        # The local equation rises with slope at least about one for a stable law; a smaller secant is not trusted.
+        step = rb / max((rb - ra) / (b - a), 0.5)
+        a, ra = b, rb
+        b = b - step
+    a, ra = start, start_r
+    reach = -2.0 * start_r
+    for _ in range(12):
+        b = start + reach
+        rb = b + law(kind, p, d + cd * b, v + cv * b, modulation, h, old, new)
+        if (rb > 0.0) != (ra > 0.0):
+            break
+        reach *= 2.0
+    for _ in range(70):
+        middle = 0.5 * (a + b)
+        rm = middle + law(kind, p, d + cd * middle, v + cv * middle, modulation, h, old, new)
+        if (rm > 0.0) == (ra > 0.0):
+            a, ra = middle, rm
+        else:
+            b, rb = middle, rm
+        if abs(rb) <= tolerance + 1e-9 * abs(b):
+            break
+    # The last call decides the memory that is kept.
+    rb = b + law(kind, p, d + cd * b, v + cv * b, modulation, h, old, new)
+    return b, rb
