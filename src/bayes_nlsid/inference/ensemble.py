@@ -302,7 +302,7 @@ class _Run:
         if self.progress is None:
             return
         done, budget = len(self.blocks) * self.block, self.most
-        if self.burn_blocks is not None:
+        if self.burn_blocks is not None and len(self.blocks) > self.burn_blocks:    # right after burn-in nothing counts yet
             s = self._chain(max(self.burn_blocks, len(self.blocks) // 2))[0]
             wanted = self.steps or LENGTH * max(integrated_time(s[..., i]) for i in range(s.shape[-1]))
             budget = int(min(self.most, max(done, self.burn_blocks * self.block + min(wanted, self.most))))
