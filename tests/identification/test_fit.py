@@ -74,7 +74,7 @@ def iwan_run(memory=True):
     return prescribed(beam(), joint, seconds=3.0), np.array([f_s, k_t, chi, beta])
 
 
-def noisy(data, level, seed=0):
+def noisy(data, level, seed=0, model=None):
     """White noise on the modal accelerations, integrated exactly."""
     rng = np.random.default_rng(seed)
     sigma = level * data.a.std(axis=0)
@@ -82,7 +82,7 @@ def noisy(data, level, seed=0):
     spectrum = np.fft.rfft(rng.normal(size=data.a.shape) * sigma, axis=0) * (frequency > 3)
     w = 2j * np.pi * np.maximum(frequency, frequency[1])
     a, v, u = (np.fft.irfft(spectrum / w**k if k else spectrum, data.n, axis=0) for k in range(3))
-    rows = beam().rows(data.locations)
+    rows = (model or beam()).rows(data.locations)
     return replace(data, a=data.a + a, v=data.v + v, u=data.u + u, q=(data.u + u) @ rows.T, qd=(data.v + v) @ rows.T, noise=2 * sigma**2 * data.dt)
 
 
