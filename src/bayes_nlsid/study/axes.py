@@ -48,11 +48,19 @@ def engineering(value: float, unit: str = "", digits: int = 3) -> str:
         return "–"
     factor, sign = prefixed([value], unit)
     scaled = value * factor
-    text = f"{scaled:.{digits}g}"
+    text = f"{scaled:#.{digits}g}".rstrip(".") if scaled else "0"
     if "e" in text:
         mantissa, power = text.split("e")
         text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
     return f"{text} {sign}".strip()
+
+
+def digits_for(low: float, high: float) -> int:
+    """Significant digits that still show the width of an interval, between 3 and 8."""
+    size, width = max(abs(low), abs(high)), abs(high - low)
+    if not (np.isfinite(size) and np.isfinite(width)) or width == 0.0:
+        return 4
+    return int(np.clip(np.ceil(np.log10(size / width)) + 2, 3, 8))
 
 
 def short_names(names: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ from html import escape
 from typing import Any, final
 
 from bayes_nlsid.study import report_page as html
-from bayes_nlsid.study.axes import engineering, unit_sign
+from bayes_nlsid.study.axes import digits_for, engineering, unit_sign
 from bayes_nlsid.study.pictures import Picture
 from bayes_nlsid.study.progress import duration
 from bayes_nlsid.study.schema import Study
@@ -129,9 +129,10 @@ def _posterior(report: Report) -> str:
     rows = []
     for p in report.result.get("parameters", []):
         u = p["unit"]
-        quantiles = [engineering(p[q], u, 4) if p.get(q) is not None else "–" for q in ("q05", "q50", "q95")]
+        digits = digits_for(p["q05"], p["q95"]) if p.get("q05") is not None else 4
+        quantiles = [engineering(p[q], u, digits) if p.get(q) is not None else "–" for q in ("q05", "q50", "q95")]
         known = "–" if "identifiable" not in p else "yes" if p["identifiable"] else "no: as wide as assumed"
-        rows.append([p["name"], engineering(p["fit"], u, 4) if p["fit"] is not None else "–", *quantiles, known,
+        rows.append([p["name"], engineering(p["fit"], u, digits) if p["fit"] is not None else "–", *quantiles, known,
                      "–" if p.get("ess") is None else f"{p['ess']:.0f}"])
     head = ["parameter", "least squares", "5 %", "50 %", "95 %", "identifiable", "effective draws"]
     out = html.table(head, rows, "stages/identify, stages/posterior (posterior.nc)", numeric=(1, 2, 3, 4, 6))

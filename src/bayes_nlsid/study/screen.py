@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayes_nlsid.study.axes import engineering
+from bayes_nlsid.study.axes import digits_for, engineering
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.story import STATUS_WORDS
 
@@ -35,8 +35,9 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
     parts += [_wrapped(f"  reason: {reason}") for reason in result["reasons"][:4]]
     rows = []
     for p in result.get("parameters", []):
-        quantiles = [engineering(p[q], p["unit"], 4) if p.get(q) is not None else "-" for q in ("q05", "q50", "q95")]
-        fitted = engineering(p["fit"], p["unit"], 4) if p["fit"] is not None else "-"
+        digits = digits_for(p["q05"], p["q95"]) if p.get("q05") is not None else 4
+        quantiles = [engineering(p[q], p["unit"], digits) if p.get(q) is not None else "-" for q in ("q05", "q50", "q95")]
+        fitted = engineering(p["fit"], p["unit"], digits) if p["fit"] is not None else "-"
         rows.append([p["name"], fitted, *quantiles, "" if p.get("identifiable", True) else "not identifiable"])
     if rows:
         shown = rows[:16] + ([[f"... {len(rows) - 16} more in result.json", "", "", "", "", ""]] if len(rows) > 16 else [])

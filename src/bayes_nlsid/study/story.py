@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayes_nlsid.study.axes import engineering
+from bayes_nlsid.study.axes import digits_for, engineering
 from bayes_nlsid.study.schema import Study
 
 STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not converged", "not_identifiable": "refused: not identifiable",
@@ -54,9 +54,8 @@ def _sure(result: Mapping[str, Any]) -> str:
     said = f"The recordings determine {len(tight)} of {len(rows)} parameters"
     if tight and tight[0]["q50"] is not None:
         best = min(tight, key=lambda p: p.get("narrowing", 1.0))
-        unit = best["unit"]
-        said += (f", best {best['name']}: {engineering(best['q50'], unit)}, 90 % between {engineering(best['q05'], unit)} and "
-                 f"{engineering(best['q95'], unit)}")
+        low, middle, high = (engineering(best[q], best["unit"], digits_for(best["q05"], best["q95"])) for q in ("q05", "q50", "q95"))
+        said += f", best {best['name']}: {middle}, 90 % between {low} and {high}"
     return said + (f"; not determined are {', '.join(loose[:6])}{' and others' if len(loose) > 6 else ''}." if loose else ".")
 
 

@@ -1,0 +1,113 @@
+"""Figures: right numbers in words, nothing lost between the samples, every picture drawn without a warning."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayes_nlsid.study.axes import axis_label, digits_for, engineering, prefixed, unit_sign
+
+
+@pytest.mark.parametrize(("value", "unit", "text"), [
+    (0.0254, "m", "25.4 mm"), (2.05e11, "N/m", "205 GN/m"), (1.2e-7, "m", "120 nm"), (4.1e8, "N/m^3", "4.10·10⁸ N/m³"),
+    (0.0, "m", "0 m"), (float("nan"), "N", "–"), (-1500.0, "N", "-1.50 kN"), (0.5, "", "0.500"), (80.03, "Hz", "80.0 Hz"),
+])
+def test_engineering(value: float, unit: str, text: str) -> None:
+    assert engineering(value, unit) == text
+
+
+def test_prefix_is_that_of_the_largest() -> None:
+    assert prefixed([1e-6, 3e-3], "m") == (1e3, "mm")
+    assert prefixed([5.0], "m/s^2") == (1.0, "m/s²")
+    assert prefixed([np.nan, np.inf], "m") == (1.0, "m")
+    assert unit_sign("N s^0.5/m^-2") == "N s⁰·⁵/m⁻²" and axis_label("chi", "") == "chi"
+
+
+def test_digits_show_the_interval() -> None:
+    low, high = 20.2984, 20.3011
+    digits = digits_for(low, high)
+    assert engineering(low, "Hz", digits) != engineering(high, "Hz", digits)
+    assert digits_for(1.0, 2.0) == 3 and digits_for(1.0, 1.0) == 4
+
+
+@pytest.mark.parametrize("n", [100, 3001, 4096, 65_536, 99_999])
+def test_envelope_hides_nothing(n: int) -> None:
+    from bayes_nlsid.study.figures import envelope
+
+    rng = np.random.default_rng(n)
+    time, signal = np.arange(n) / 100.0, rng.standard_normal(n)
+    signal[-1] = 50.0
+    t, low, high = envelope(time, signal)
+    assert high.max() == 50.0 and low.min() == signal.min()
+    assert len(t) <= 3000 and t[-1] >= time[-1] - 2 * n / 1500 / 100
+
+
+def test_spectrum_of_white_noise() -> None:
+    """Unit variance at 1000 Hz has a one-sided density of 2/1000, amplitude √0.002; the scatter of ten averages is a few per cent."""
+    from bayes_nlsid.study.figures import spectrum
+
+    frequency, amplitude = spectrum(np.random.default_rng(3).standard_normal(2**16), 1e-3)
+    assert frequency[-1] == 500.0
+    assert np.mean(amplitude[5:-5] ** 2) == pytest.approx(2e-3, rel=0.03)
+
+
+def pictures() -> dict[str, Any]:
+    """Every figure with synthetic numbers, also the awkward ones: nothing tried, one draw, NaN, a single joint."""
+    from bayes_nlsid.study import figures as f
+    from bayes_nlsid.study import figures_inference as i
+    from bayes_nlsid.study import figures_prediction as p
+
+    rng = np.random.default_rng(1)
+    n = 3000
+    t = np.arange(n) / 1000.0
+    signals = np.stack([np.exp(-2 * t) * np.sin(2 * np.pi * 80 * t) * 200, rng.standard_normal(n)], axis=1)
+    line = np.linspace(0, 500, 50)
+    psd = np.full((50, 2), 1e-4)
+    psd[:, 1] = np.nan
+    modes = {"frequency": np.array([80.0, 298.0]), "zeta": np.array([2e-3, 1e-3]), "frequency_sd": np.array([0.02, 0.1]),
+             "number": np.array([1, 2])}
+    draws = np.array([2000.0, 1e8, -0.5, 0.1]) * (1 + 0.05 * rng.standard_normal((500, 4)))
+    names = [f"iwan4[J1_slip].{x}" for x in ("f_s", "k_t", "chi", "beta")]
+    units = ["N", "N/m", "", ""]
+    chains = draws[:480].reshape(2, 30, 8, 4)
+    a = np.geomspace(1e-5, 1e-3, 20)
+    bands = {"amplitude": a, **{f"frequency_{q}": 80 - 500 * a + d for q, d in (("q05", -0.1), ("q50", 0.0), ("q95", 0.1))},
+             **{f"damping_{q}": (1e-3 + a) * d for q, d in (("q05", 0.9), ("q50", 1.0), ("q95", 1.1))}}
+    gaps = {k: np.where(a > 5e-4, np.nan, v) if k != "amplitude" else v for k, v in bands.items()}
+    single = {k: bands[k.replace("q05", "q50").replace("q95", "q50")] for k in bands}
+    loop = {"location": "J1_slip", "term": "iwan4", "q": 1e-6 * np.cos(t[:200] * 31.4), "force": rng.standard_normal((5, 200))}
+    tried = [{"step": 0, "name": f"t{k}", "mse": 0.5 / (k + 1)} for k in range(20)]
+    steps = [{"phase": "forward", "name": "t19", "mse": 0.025}, {"phase": "backward", "name": "t19", "mse": 0.026}]
+    band = (signals[:, 0] - 1, signals[:, 0], signals[:, 0] + 1)
+    return {
+        "recording": (f.recording_overview, (t, signals, ["a", "force"], ["m/s^2", "N"]),
+                      {"windows": [("train", 0.1, 1.0), ("all", 0.0, 3.0)], "noise": (line, psd), "band": (40.0, 160.0), "modes": [80.0]}),
+        "linear": (f.linear_model, (modes, {"frequency": np.array([79.0, 300.0])}, np.eye(2)), {"before": np.array([70.0, np.nan])}),
+        "selection": (i.selection_path, (steps, tried), {"floor": 1e-3, "linear": 0.6}),
+        "no selection": (i.selection_path, ([], []), {"floor": None, "linear": 0.6}),
+        "marginals": (i.posterior_marginals, (draws, names, units), {"prior": 2 * draws, "fit": draws[0], "identifiable": [1, 1, 0, 1]}),
+        "one marginal": (i.posterior_marginals, (np.ones((50, 1)), names[:1], units[:1]), {}),
+        "pairs": (i.posterior_pairs, (draws, names, units), {"worst": [3, 0, 1], "fit": draws[0]}),
+        "convergence": (i.convergence, (chains[..., 0], chains, names, units), {"kept_from": 5, "worst": [0]}),
+        "loops": (p.joint_loops, ([loop] * 4,), {}), "one loop": (p.joint_loops, ([loop],), {}),
+        "backbone": (p.backbone_bands, (bands, {"amplitude": a, "frequency": 80 - 500 * a, "damping": 1e-3 + a}),
+                     {"location": "tip", "numerical": np.full(20, 1e-3), "published": [{"label": "paper", "frequency": (79, 81), "damping": None}],
+                      "alternatives": [{"name": "static", "amplitude": a, "frequency": 0 * a + 80, "damping": 0 * a + 1e-3}]}),
+        "backbone with gaps": (p.backbone_bands, (gaps,), {}), "backbone of one": (p.backbone_bands, (single,), {}),
+        "heldout": (p.heldout_overlay, (t, signals[:, 0], *band), {"unit": "m/s^2", "channel": "a", "zoom": 0.05, "noise": 0.1, "facts": "x"}),
+    }
+
+
+@pytest.mark.parametrize("name", list(pictures()))
+def test_every_picture_is_drawn(name: str) -> None:
+    """Warnings are errors, so a collapsed layout, an empty legend or a missing glyph fails here."""
+    from bayes_nlsid.study.figures import DPI, WIDTH, png
+
+    draw, arguments, options = pictures()[name]
+    image = png(draw, *arguments, **options)
+    width, height = struct.unpack(">II", image[16:24])
+    assert image[:4] == b"\x89PNG" and width == round(WIDTH * DPI) and height > 300
+    assert image == png(draw, *arguments, **options), "the same numbers give the same bytes"
