@@ -126,7 +126,11 @@ def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
     status : ``"ok"`` or ``"not converged"``
     """
     if all(law.slope is not None for law in laws):
-        return _newton(paths, record, laws, start, max(most // 3, 4), tolerance)
+        first = _sweep(paths, record, laws) if start is None and not paths.periodic else start
+        found = _newton(paths, record, laws, first, max(most // 3, 4), tolerance)
+        if found[2] == "ok" or most < 30 or not paths.periodic:
+            return found
+        return _newton(paths, record, laws, _sweep(paths, record, laws), max(most // 3, 4), tolerance)
     return _relax(paths, record, laws, start, most, tolerance)
 
 
@@ -185,6 +189,79 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
         D = D + length * step
         (rest, G, d, v, g), error = trial, new
     return D, G, "ok" if error < 30 * tolerance else "not converged"
+
+
+def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 384) -> Complex:
+    """A first guess for strong laws: solve short windows one after the other, in the order of time (waveform relaxation).
+
+    The motion follows from the past only, so each window is a Volterra equation with a short memory, which Newton's method solves where
+    the whole record defeats it. A burst is gone through once, a period until it closes on itself.
+    """
+    J, n = paths.to_force.shape[1], paths.samples
+    d, v = paths.in_time(paths.linear(record))
+    kernel = np.fft.irfft(paths.among, n, axis=0)                                  # (n, J, J) motion per unit force sample
+    speed = np.fft.irfft(paths.s[:, None, None] * paths.among, n, axis=0)
+    K, V = np.fft.rfft(kernel, axis=0), np.fft.rfft(speed, axis=0)
+    short = [np.fft.rfft(np.concatenate([k[:window], np.zeros_like(k[:window])]), axis=0) for k in (kernel, speed)]
+    g = np.zeros((n, J))
+    for turn in range(1 if not paths.periodic else 4):
+        change = 0.0
+        for first in range(0, n, window):
+            here = slice(first, min(first + window, n))
+            old = g[here].copy()
+            new = _window(laws, d[here], v[here], old, old, short, window, paths.dt)
+            step = np.zeros((n, J))
+            step[here] = new - old
+            spectrum = np.fft.rfft(step, axis=0)
+            d = d - np.fft.irfft(_mul(K, spectrum), n, axis=0)
+            v = v - np.fft.irfft(_mul(V, spectrum), n, axis=0)
+            g[here] = new
+            change += float((step ** 2).sum())
+        if change < 1e-8 * float((g ** 2).sum()):
+            break
+    return paths.linear(record) - _mul(paths.among, paths.to_lines(g))
+
+
+def _window(laws: tuple[LawAlong, ...], d: Array, v: Array, old: Array, guess: Array, short: list[Complex], window: int, dt: float) -> Array:
+    """Forces (w, J) of one window such that they are the law along the motion they cause."""
+    w = len(d)
+
+    def through(kernel: Complex, x: Array) -> Array:
+        padded = np.concatenate([x, np.zeros((2 * window - w, x.shape[1]))])
+        return np.asarray(np.fft.irfft(_mul(kernel, np.fft.rfft(padded, axis=0)), 2 * window, axis=0)[:w])
+
+    base_d, base_v = d + through(short[0], old), v + through(short[1], old)
+
+    def state(g: Array) -> tuple[Array, Array, Array]:
+        dd, vv = base_d - through(short[0], g), base_v - through(short[1], g)
+        return dd, vv, g - np.stack([law.force(dd[:, j], vv[:, j], dt) for j, law in enumerate(laws)], axis=1)
+
+    g = guess
+    dd, vv, rest = state(g)
+    size = float(np.linalg.norm(g - rest)) + 1e-300
+    for _ in range(25):
+        error = float(np.linalg.norm(rest))
+        if error < 1e-7 * size or not np.isfinite(error):
+            break
+        slopes = [law.slope(dd[:, j], vv[:, j]) for j, law in enumerate(laws) if law.slope is not None]
+        stiff, damp = np.stack([a for a, _ in slopes], axis=1), np.stack([b for _, b in slopes], axis=1)
+
+        def apply(x: Complex, stiff: Array = stiff, damp: Array = damp) -> Complex:
+            return np.asarray(x + stiff * through(short[0], x.real) + damp * through(short[1], x.real), dtype=complex)
+
+        step = gmres(apply, -rest.astype(complex), 30, 0.02).real
+        length = 1.0
+        for _ in range(8):
+            trial = state(g + length * step)
+            if np.isfinite(trial[2]).all() and float(np.linalg.norm(trial[2])) < error:
+                break
+            length /= 2.5
+        else:
+            break
+        g = g + length * step
+        dd, vv, rest = trial
+        size = max(size, float(np.linalg.norm(g)))
+    return g
 
 
 def gmres(apply: Callable[[Complex], Complex], right: Complex, most: int, tolerance: float) -> Complex:

@@ -116,7 +116,7 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> lis
     out = []
     for i, h in enumerate(singles):
         if i < 3 and h.forces and gain > 30 and h.cost - best < 0.35 * gain:
-            h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=8)), key=lambda z: z.cost)
+            h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=8, globally=True)), key=lambda z: z.cost)
         out.append(h)
     return sorted(out, key=lambda z: z.cost)
 
