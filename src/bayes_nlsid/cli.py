@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     check = add("check", "read everything, say what would be done and what is missing; compute nothing", _check)
     check.add_argument("study", metavar="STUDY.toml")
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
-    diagnose.add_argument("study", metavar="PATH", help="study file or case folder")
+    diagnose.add_argument("study", metavar="PATH", help="case folder")
     for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),
                        ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
                        ("frf", "stepped-sine response curves with posterior bands")):
@@ -171,11 +171,20 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _diagnose(options: argparse.Namespace) -> int:
-    return _not_here(options, "the mismatch engine")
+    from bayes_nlsid.study.diagnosing import lines, run_diagnosis
+
+    out = Path(options.out)
+    found = run_diagnosis(options.study, out, seed=options.seed or 0, reporter=_reporter(options, out))
+    if not options.quiet:
+        print(lines(found) + f"\n\nin {out}: report.html, diagnosis.json, predictions.npz, figures/")
+    return REFUSED if found.verdict == "cannot_tell" else DONE
 
 
 def _hypotheses(options: argparse.Namespace) -> int:
-    return _not_here(options, "the catalogue of hypotheses")
+    from bayes_nlsid.study.screen import hypotheses_table
+
+    print(hypotheses_table())
+    return DONE
 
 
 def _absent(options: argparse.Namespace) -> int:

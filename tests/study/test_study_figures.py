@@ -94,10 +94,12 @@ def pictures() -> dict[str, Any]:
         "convergence": (i.convergence, (chains[..., 0], chains, names, units), {"kept_from": 5, "worst": [0]}),
         "loops": (p.joint_loops, ([loop] * 4,), {}), "one loop": (p.joint_loops, ([loop],), {}),
         "backbone": (p.backbone_bands, (bands, {"amplitude": a, "frequency": 80 - 500 * a, "damping": 1e-3 + a}),
-                     {"location": "tip", "numerical": np.full(20, 1e-3), "published": [{"label": "paper", "frequency": (79, 81), "damping": None}],
+                     {"location": "tip", "numerical": np.full(20, 1e-3),
+                      "published": [{"label": "paper", "frequency": (79, 81), "damping": None}],
                       "alternatives": [{"name": "static", "amplitude": a, "frequency": 0 * a + 80, "damping": 0 * a + 1e-3}]}),
         "backbone with gaps": (p.backbone_bands, (gaps,), {}), "backbone of one": (p.backbone_bands, (single,), {}),
-        "heldout": (p.heldout_overlay, (t, signals[:, 0], *band), {"unit": "m/s^2", "channel": "a", "zoom": 0.05, "noise": 0.1, "facts": "x"}),
+        "heldout": (p.heldout_overlay, (t, signals[:, 0], *band),
+                    {"unit": "m/s^2", "channel": "a", "zoom": 0.05, "noise": 0.1, "facts": "x"}),
     }
 
 

@@ -59,7 +59,8 @@ def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -
     groups = {"sensors": structure.sensors, "inputs": structure.inputs, "joints": structure.joints}
     masters = tuple(dict.fromkeys(name for word in entry.masters for name in groups.get(word, (word,))))
     try:
-        reduced = guyan(structure, masters, guard="constrain") if entry.method == "guyan" else iirs(structure, masters, iterations=entry.iterations, guard="constrain")
+        reduced = (guyan(structure, masters, guard="constrain") if entry.method == "guyan"
+                   else iirs(structure, masters, iterations=entry.iterations, guard="constrain"))
         return modal_model(reduced, modes, zeta=entry.damping)
     except ValueError as error:
         raise InputError("[reduction] masters", str(error), "name more masters, or fewer modes") from None

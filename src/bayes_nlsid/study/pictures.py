@@ -170,7 +170,7 @@ def _loops(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     from bayes_nlsid.study.figures_prediction import joint_loops
 
     saved = done["predict"]
-    loops = [{"location": entry["location"], "term": entry["term"], "q": saved.arrays[f"loop{i}.q"], "force": saved.arrays[f"loop{i}.force"]}
+    loops = [{**entry, "q": saved.arrays[f"loop{i}.q"], "force": saved.arrays[f"loop{i}.force"]}
              for i, entry in enumerate(saved.data.get("loops", []))]
     if not loops:
         return []

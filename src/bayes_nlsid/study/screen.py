@@ -97,3 +97,9 @@ def terms_table() -> str:
     return columns(["number", "term", "parity", "memory", "sure", "parameters", "force"], rows, right=(0,)) + "\n\n" + _wrapped(note)
 
 
+def hypotheses_table() -> str:
+    """The catalogue of what may be missing."""
+    from bayes_nlsid.mismatch.catalogue import catalogue_rows
+
+    rows = [[row["class"], row["sits"], row["phase"], row["claim"]] for row in catalogue_rows()]
+    return columns(["class", "where", "in phase with", "claim"], rows)

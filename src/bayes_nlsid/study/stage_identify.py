@@ -166,15 +166,15 @@ def _refined(context: Context, found: Fit, progress: Any) -> Fit:
     """Least squares on the simulated response, started from the regression."""
     from bayes_nlsid.identification.output_error import output_error
 
-    progress(0.9, "refining on the simulated response")
-    return output_error(found, context.role("train"))
+    return output_error(found, context.role("train"), progress=lambda share, sentence: progress(0.8 + 0.2 * share, sentence))
 
 
 def _record(name: str, found: Fit, linear: float, selection: Selection | None) -> dict[str, Any]:
     problem = found.problem
+    regression = float(problem.mse(found.theta)) if np.isfinite(found.theta).all() else found.mse
     record: dict[str, Any] = {
         "name": name, "elements": [element_record(e) for e in problem.model.elements], "names": list(problem.names),
-        "units": [p.unit for p in problem.model.parameters], "mse": found.mse, "mse_linear": linear, "floor": float(problem.floor),
+        "units": [p.unit for p in problem.model.parameters], "mse": regression, "mse_of_fit": found.mse, "mse_linear": linear, "floor": float(problem.floor),
         "rank": found.rank, "status": found.status, "reasons": list(found.reasons), "samples": problem.samples,
         "starts": [{"mse": s.mse, "status": s.status, "evaluations": s.evaluations, "seconds": s.seconds} for s in found.starts]}
     if selection is not None:
@@ -197,8 +197,8 @@ def stored_fit(context: Context, variant: int = 0) -> Fit:
     pick = {name: np.asarray(saved.arrays[f"{variant}.{name}"], dtype=float) for name in ("theta", "s", "covariance")}
     starts = tuple(Start(np.asarray(at, dtype=float), entry["mse"], entry["status"], entry["evaluations"], entry["seconds"])
                    for at, entry in zip(saved.arrays[f"{variant}.starts"], record["starts"], strict=True))
-    return Fit(pick["theta"], pick["s"], record["mse"], pick["covariance"], record["rank"], starts, record["status"], tuple(record["reasons"]),
-               problem, problem.weight, context.number(f"identify {record['name']}"))
+    return Fit(pick["theta"], pick["s"], record["mse_of_fit"], pick["covariance"], record["rank"], starts, record["status"],
+               tuple(record["reasons"]), problem, problem.weight, context.number(f"identify {record['name']}"))
 
 
 def stored_model(context: Context, variant: int = 0) -> tuple[Model, np.ndarray]:
