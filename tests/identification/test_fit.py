@@ -83,7 +83,8 @@ def noisy(data, level, seed=0, model=None):
     w = 2j * np.pi * np.maximum(frequency, frequency[1])
     a, v, u = (np.fft.irfft(spectrum / w**k if k else spectrum, data.n, axis=0) for k in range(3))
     rows = (model or beam()).rows(data.locations)
-    return replace(data, a=data.a + a, v=data.v + v, u=data.u + u, q=(data.u + u) @ rows.T, qd=(data.v + v) @ rows.T, noise=2 * sigma**2 * data.dt)
+    return replace(data, a=data.a + a, v=data.v + v, u=data.u + u, q=(data.u + u) @ rows.T, qd=(data.v + v) @ rows.T,
+                   noise=2 * sigma**2 * data.dt)
 
 
 def test_linear_coefficients_return_in_closed_form():
@@ -113,7 +114,8 @@ def test_iwan_with_memory_returns():
 
 def test_bouc_wen_returns():
     model, data, truth = bouc_wen_run()
-    problem = Problem(Model(model, (Element(LIBRARY["bouc_wen"], ("J1",), fixed=(("nu", 1.0), ("gamma", 0.8))),), (0,)), (data,), scenario("S1", 1, 0))
+    problem = Problem(Model(model, (Element(LIBRARY["bouc_wen"], ("J1",), fixed=(("nu", 1.0), ("gamma", 0.8))),), (0,)), (data,),
+                      scenario("S1", 1, 0))
     found = fit(problem, starts=8, seed=1)
     assert found.theta[2:] == pytest.approx(truth[[0, 1, 3]], rel=5e-3)
 
@@ -168,7 +170,8 @@ def test_starts_are_kept_and_seeded():
 
 def test_warm_start_is_used_exactly():
     problem = make(Element(LIBRARY["jenkins_memory"], ("J1", "J2")), slider_run())
-    truth = {"jenkins_memory[J1].f_s": 1.2, "jenkins_memory[J1].k_t": 3000.0, "jenkins_memory[J2].f_s": 0.9, "jenkins_memory[J2].k_t": 5000.0}
+    truth = {"jenkins_memory[J1].f_s": 1.2, "jenkins_memory[J1].k_t": 3000.0, "jenkins_memory[J2].f_s": 0.9,
+             "jenkins_memory[J2].k_t": 5000.0}
     assert fit(problem, starts=1, warm=truth).mse < 1e-20
     with pytest.raises(ValueError, match="warm has shape"):
         fit(problem, warm=np.zeros(2))
@@ -271,8 +274,8 @@ def test_papers_thresholds_stop_the_search():
 
 def test_decay_and_sweep_together_fix_what_either_leaves_open():
     """Two recordings at different levels: one fit, smaller uncertainty than from either."""
-    low, high = prescribed(beam(), cubic_joint, size=3e-4, seconds=2.0, seed=1), prescribed(beam(), cubic_joint, size=1e-3, seconds=2.0, seed=2)
-    low, high = noisy(low, 0.01, 1), noisy(high, 0.01, 2)
+    low = noisy(prescribed(beam(), cubic_joint, size=3e-4, seconds=2.0, seed=1), 0.01, 1)
+    high = noisy(prescribed(beam(), cubic_joint, size=1e-3, seconds=2.0, seed=2), 0.01, 2)
     element = Element(LIBRARY["cubic"], ("J1", "J2"))
     sd = {name: np.sqrt(np.diag(fit(make(element, data)).covariance)) for name, data in
           (("low", low), ("high", high), ("both", (low, high)))}

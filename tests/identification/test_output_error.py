@@ -34,7 +34,8 @@ def sweep(noise=0.0):
     response = response + noise * response.std(axis=0) * rng.normal(size=response.shape)
     time = np.arange(data.n) * data.dt
     channels = tuple(Channel(f"a{n}", n, "acceleration", "m/s^2") for n in ("J1", "TIP"))
-    recording = Recording(data.name, data.dt, response, channels, np.array([[drive(t)] for t in time]), (Channel("F", "TIP", "force", "N"),))
+    recording = Recording(data.name, data.dt, response, channels, np.array([[drive(t)] for t in time]),
+                          (Channel("F", "TIP", "force", "N"),))
     return model, data, recording
 
 

@@ -30,7 +30,8 @@ def pack(model: ModalModel, dt: float, u: np.ndarray, v: np.ndarray, a: np.ndarr
                      np.full(model.modes, noise), periodic=periodic)
 
 
-def integrated(model: ModalModel, joint_force: Callable[[np.ndarray, np.ndarray], np.ndarray], *, seconds: float = 3.0, rate: float = 1024.0,
+def integrated(model: ModalModel, joint_force: Callable[[np.ndarray, np.ndarray], np.ndarray], *, seconds: float = 3.0,
+               rate: float = 1024.0,
                drive: Callable[[float], float] | None = None, u0: np.ndarray | None = None, **options: object) -> ModalData:
     """Solve the modal equations with forces at the joints by DOP853 and recompute the acceleration from the equation."""
     rows, tip = model.rows(model.joints), model.rows(("TIP",))[0]
@@ -50,7 +51,8 @@ def integrated(model: ModalModel, joint_force: Callable[[np.ndarray, np.ndarray]
     return pack(model, 1 / rate, u, v, a, force, **options)  # type: ignore[arg-type]
 
 
-def prescribed(model: ModalModel, joint_force: Callable[[np.ndarray, np.ndarray], np.ndarray], *, seconds: float = 4.0, rate: float = 1024.0,
+def prescribed(model: ModalModel, joint_force: Callable[[np.ndarray, np.ndarray], np.ndarray], *, seconds: float = 4.0,
+               rate: float = 1024.0,
                size: float = 1e-3, seed: int = 0, **options: object) -> ModalData:
     """A smooth modal motion of several tones, exact in all derivatives, and the force that makes it a solution.
 

@@ -72,7 +72,8 @@ def _element_bounds(element: Element, observed: Observed, widening: float) -> li
     lever = {name: float(np.linalg.norm(observed.leverage(name))) for name in element.locations}
     top = max(lever.values())
     if top == 0:
-        raise ValueError(f"element {element.term.name!r}: {element.locations} do not act on the equations of scenario {observed.scenario.name!r}")
+        raise ValueError(f"element {element.term.name!r}: {element.locations} do not act on the equations of scenario "
+                         f"{observed.scenario.name!r}")
     total = float(np.linalg.norm(observed.linear_force))
     out = []
     for group in element.groups:

@@ -66,7 +66,7 @@ class Elimination:
         if self.count == 0:
             return np.zeros(0), target, self.q
         right = -(self.q.T @ target)
-        scaled = np.linalg.lstsq(self.r, right, rcond=1e-13)[0]
+        scaled: NDArray[np.float64] = np.asarray(np.linalg.lstsq(self.r, right, rcond=1e-13)[0], dtype=np.float64)
         # One step of refinement against the true residual recovers the digits that a close cancellation costs.
         scaled = scaled + np.linalg.lstsq(self.r, -(self.q.T @ (target + self.q @ (self.r @ scaled))), rcond=1e-13)[0]
         lower, upper = self._box(scaled)

@@ -104,8 +104,8 @@ def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[n
     weights : ndarray (N,) or None
         Weights of the squared entries; None is ``problem.default_weight``, ``problem.weight`` is Eq. 13a.
     warm : mapping of name to value, array (P,), or None
-        Values from an earlier fit, which replace the random ones. If all are known the first start is exactly there, the others stay random;
-        otherwise every start takes the known ones and draws the rest.
+        Values from an earlier fit, which replace the random ones. If all are known the first start is exactly there, the others stay
+        random; otherwise every start takes the known ones and draws the rest.
     iterations : int
         Limit per start.
 
@@ -189,7 +189,8 @@ def _result(problem: Problem, weights: NDArray[np.float64], tried: tuple[Start, 
     return Fit(best.theta, problem.to_s(best.theta), best.mse, covariance, rank, tried, status, tuple(reasons), problem, weights, seed)
 
 
-def covariance_at(problem: Problem, theta: NDArray[np.float64], weights: NDArray[np.float64], mse: float) -> tuple[NDArray[np.float64], int]:
+def covariance_at(problem: Problem, theta: NDArray[np.float64], weights: NDArray[np.float64],
+                  mse: float) -> tuple[NDArray[np.float64], int]:
     """Covariance (P, P) in s and the number of informed directions, see ``Fit.covariance``."""
     size = len(problem.names)
     if size == 0:

@@ -78,7 +78,8 @@ class Observed:
         for entry in self.data:
             missing = set(self.scenario.coupled) - set(entry.modes)
             if missing:
-                raise ValueError(f"recording {entry.name!r} was not observed in modes {sorted(missing)} of scenario {self.scenario.name!r}; "
+                raise ValueError(f"recording {entry.name!r} was not observed in modes {sorted(missing)} of scenario "
+                                 f"{self.scenario.name!r}; "
                                  "observe them in modal_data or take them out of the scenario")
             spectra.append(Spectrum(entry.n, entry.dt, entry.valid, self._band(entry), entry.periodic, self.taper))
         object.__setattr__(self, "spectra", tuple(spectra))

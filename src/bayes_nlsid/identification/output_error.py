@@ -22,7 +22,8 @@ from bayes_nlsid.recordings.recording import Recording
 from bayes_nlsid.simulation.replay import predict_record
 
 Array = NDArray[np.float64]
-DIFFERENCE = 1e-6                     # step of a numerical derivative, share of the box: small against one radian of phase at the end of a record
+# step of a numerical derivative, share of the box: small against one radian of phase at the end of a record
+DIFFERENCE = 1e-6
 DAMPINGS = 10.0 ** np.arange(-2, 3)   # tried together, times the current one
 
 
@@ -93,7 +94,8 @@ class OutputError:
         for run, substeps in zip(self.runs, self.substeps, strict=True):
             states = x[:, at:at + len(run.unknown)]
             at += len(run.unknown)
-            found = predict_record(self.problem.model, theta, run.recording, substeps=substeps, **_state(run, states))
+            u0, v0 = _state(run, states)
+            found = predict_record(self.problem.model, theta, run.recording, substeps=substeps, u0=u0, v0=v0)
             with np.errstate(all="ignore"):
                 values = np.moveaxis(run.spectrum.apply(np.moveaxis(found.values / run.scale, 1, 2)), 1, 2) - run.measured
             values[~found.ok] = np.inf
@@ -101,13 +103,14 @@ class OutputError:
         return np.concatenate(parts, axis=1)
 
 
-def _state(run: _Run, states: Array) -> dict[str, Array]:
+def _state(run: _Run, states: Array) -> tuple[Array | None, Array | None]:
+    """Modal state (S, m), (S, m) at the first sample for unknown parts (S, unknown) in units of their spread."""
     if run.u0 is None or run.v0 is None:
-        return {}
+        return None, None
     start = np.tile(np.concatenate([run.u0, run.v0]), (len(states), 1))
     start[:, run.unknown] += states * run.spread[run.unknown]
     half = len(run.u0)
-    return {"u0": start[:, :half], "v0": start[:, half:]}
+    return start[:, :half], start[:, half:]
 
 
 def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int = 25, tolerance: float = 1e-3,
@@ -157,7 +160,8 @@ def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int =
     if piled := problem.piled(theta):
         reasons.append(f"at a bound: {', '.join(piled)}")
     start = Start(theta, mse, status, spent, time.perf_counter() - began)
-    return Fit(theta, problem.to_s(theta), mse, covariance, rank, (start, *fit.starts), "ok" if status == "converged" else status, tuple(reasons),
+    return Fit(theta, problem.to_s(theta), mse, covariance, rank, (start, *fit.starts), "ok" if status == "converged" else status,
+               tuple(reasons),
                problem, fit.weights, fit.seed)
 
 
@@ -178,9 +182,11 @@ def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float) -> tup
     scales = _scales([c[0] for c in cut], measured)
     runs = tuple(_Run(part, spectrum, values / scale, scale, u0, v0, spread)
                  for (part, u0, v0, spread), spectrum, values, scale in zip(cut, spectra, measured, scales, strict=True))
-    substeps = tuple(predict_record(problem.model, fit.theta[None], run.recording, tolerance=tolerance, **_state(run, np.zeros((1, len(run.unknown))))).substeps
-                     for run in runs)
-    error = OutputError(problem, runs, substeps)
+    substeps = []
+    for run in runs:
+        u0, v0 = _state(run, np.zeros((1, len(run.unknown))))
+        substeps.append(predict_record(problem.model, fit.theta[None], run.recording, tolerance=tolerance, u0=u0, v0=v0).substeps)
+    error = OutputError(problem, runs, tuple(substeps))
     return error, np.concatenate([error.coordinates.to_s(fit.theta), np.zeros(error.size[1])])
 
 
@@ -202,7 +208,8 @@ def _begin(problem: Problem, recording: Recording, index: int) -> tuple[Recordin
 
 
 def _scales(parts: list[Recording], measured: list[Array]) -> list[Array]:
-    """Scale (s,) of the channels of every recording: in-band rms per entry over all channels of the same quantity, all recordings together."""
+    """Scale (s,) of the channels of every recording: in-band rms per entry over all channels of the same quantity, all recordings
+    together."""
     power: dict[str, list[float]] = {}
     for part, values in zip(parts, measured, strict=True):
         for channel, column in zip(part.channels, values.T, strict=True):

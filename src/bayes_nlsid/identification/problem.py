@@ -95,13 +95,15 @@ class Problem:
         object.__setattr__(self, "data", tuple(self.data))
         astray = set(self.model.free_modes) - set(self.scenario.equations)
         if astray:
-            raise ValueError(f"free modes {sorted(astray)} have no equation in scenario {self.scenario.name!r}; free only {self.scenario.equations}")
+            raise ValueError(f"free modes {sorted(astray)} have no equation in scenario {self.scenario.name!r}; free only "
+                             f"{self.scenario.equations}")
         if self.observed is None:
             object.__setattr__(self, "observed", Observed(self.model.linear, self.data, self.scenario, self.band, self.taper))
         if not (np.isfinite(self.c) and self.c > 0):
             raise ValueError(f"c must be positive and finite, got {self.c}")
         object.__setattr__(self, "bounds", bounds(self.model, self.observed, self.widening, self.linear_widening))
-        signed = [p.param is not None and (p.param.signed or low <= 0) for p, low in zip(self.model.parameters, self.bounds[:, 0], strict=True)]
+        signed = [p.param is not None and (p.param.signed or low <= 0)
+                  for p, low in zip(self.model.parameters, self.bounds[:, 0], strict=True)]
         object.__setattr__(self, "coordinates", Coordinates(np.where(signed, self.c, 0.0)))
         self._split()
 
@@ -127,7 +129,8 @@ class Problem:
                 else:
                     base = base + self._piece_force(piece, np.zeros(self.model.size))
             if element.term.linear and open_slots and element.excess and not np.any(columns[-len(element.groups):]):
-                raise ValueError(f"element {element.term.name!r}: excess=True leaves nothing of it at {element.locations}; use excess=False")
+                raise ValueError(f"element {element.term.name!r}: excess=True leaves nothing of it at {element.locations}; use "
+                                 f"excess=False")
         object.__setattr__(self, "base", base)
         object.__setattr__(self, "columns", np.array(columns).reshape(len(columns), seen.size))
         object.__setattr__(self, "linear_index", tuple(index))

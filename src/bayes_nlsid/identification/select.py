@@ -104,11 +104,15 @@ class _Search:
     progress: Progress | None
 
     def attempt(self, elements: tuple[Element, ...], warm: dict[str, float], tag: str, starts: int) -> Fit | str:
-        """Fit one set of elements, or say why it cannot be."""
+        """Fit one set of elements, or say why it cannot be.
+
+        Random starts explore what is new. Where all that is nonlinear is known from the last round, they would only repeat its search.
+        """
         seed = int(np.random.SeedSequence([self.seed, zlib.crc32(tag.encode())]).generate_state(1)[0])
         try:
-            return fit(self.problem.with_elements(self.problem.model.elements + elements), starts=starts, seed=seed,
-                       weights=self.weights, warm=warm)
+            problem = self.problem.with_elements(self.problem.model.elements + elements)
+            known = all(problem.names[i] in warm for piece in problem.pieces for i in piece.columns)
+            return fit(problem, starts=1 if known else starts, seed=seed, weights=self.weights, warm=warm)
         except ValueError as error:
             return str(error)
 
@@ -233,7 +237,8 @@ def _forward(search: _Search, named: dict[str, Element], linear: Fit, most: int)
     return chosen, current, path, tried
 
 
-def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float]], current: Fit, tried: list[Trial]) -> tuple[Step, dict[str, Fit]]:
+def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float]], current: Fit,
+           tried: list[Trial]) -> tuple[Step, dict[str, Fit]]:
     """Rank the candidates of a forward round; fill ``tried``."""
     fits = {name: f for name, (f, _) in found.items() if isinstance(f, Fit) and np.isfinite(f.mse)}
     limits = {name: search.threshold(len(f.theta) - len(current.theta), len(found)) for name, f in fits.items()}
@@ -260,7 +265,8 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
         if not accepted:
             floor = max(search.problem.floor, search.problem.rounding_floor)
             reason += f"; noise floor {floor:.3g}" if floor else ""
-    aliases = tuple(name for name in order if accepted and name != best and _same(fits[name], fits[best], variance, search.problem.rounding_floor))
+    aliases = tuple(name for name in order if accepted and name != best
+                    and _same(fits[name], fits[best], variance, search.problem.rounding_floor))
     return Step(number, "add", best, fits[best].mse, accepted, reason, aliases), fits
 
 
@@ -297,7 +303,8 @@ def _backward(search: _Search, chosen: list[str], current: Fit, path: list[Step]
         best = min(fits, key=lambda name: (fits[name].mse, name))
         loss = fits[best].mse - current.mse
         dispensable = loss < search.eps2 if search.eps2 is not None else values[best] <= limits[best]
-        path.append(Step(number, "remove", best, fits[best].mse, dispensable, f"mean square {current.mse:.3g} -> {fits[best].mse:.3g} without it"))
+        reason = f"mean square {current.mse:.3g} -> {fits[best].mse:.3g} without it"
+        path.append(Step(number, "remove", best, fits[best].mse, dispensable, reason))
         if not dispensable:
             break
         kept.remove(best)

@@ -91,7 +91,8 @@ class Spectrum:
         tiny = 1e-9 / self.dt
         inside = np.flatnonzero((frequencies >= self.band[0] - tiny) & (frequencies <= self.band[1] + tiny))
         if len(inside) < 2:
-            raise ValueError(f"band {self.band} Hz holds {len(inside)} frequencies of a record of {count * self.dt:g} s; widen it or use a longer record")
+            raise ValueError(f"band {self.band} Hz holds {len(inside)} frequencies of a record of {count * self.dt:g} s; widen it or "
+                             f"use a longer record")
         frequency = frequencies[inside]
         # The zero and Nyquist bins have no mirror image, all others stand for two.
         single = (inside == 0) | ((count % 2 == 0) & (inside == count // 2))
@@ -116,7 +117,8 @@ class Spectrum:
         return float(np.mean(self.window**2) ** 2 / np.mean(self.window**4))
 
     def apply(self, samples: ArrayLike) -> NDArray[np.float64]:
-        """Transform (..., n) of the whole recording, or (..., count) of the samples that enter, to (..., 2 bins): real parts, then imaginary."""
+        """Transform (..., n) of the whole recording, or (..., count) of the samples that enter, to (..., 2 bins): real parts, then
+        imaginary."""
         values = np.asarray(samples, dtype=float)
         if values.shape[-1] == self.n and self.n != self.count:
             values = values[..., self.samples]

@@ -69,7 +69,8 @@ def to_inference_data(posterior: Posterior, likelihood: Likelihood | None = None
         groups["constant_data"] = _constant(posterior, xarray)
         if likelihood is not None:
             groups |= _likelihood_groups(likelihood, chains, blocks_of, xarray)
-        attributes = {"seed": posterior.seed, "likelihood": posterior.likelihood, "status": posterior.status, "reasons": "; ".join(posterior.reasons),
+        attributes = {"seed": posterior.seed, "likelihood": posterior.likelihood, "status": posterior.status,
+                      "reasons": "; ".join(posterior.reasons),
                       "burn": posterior.burn}
         return arviz.InferenceData(attrs=attributes, **groups)
 
@@ -105,7 +106,8 @@ def _constant(posterior: Posterior, xarray: Any) -> Any:
             "prior_upper": np.array([p.upper for p in posterior.priors]), "prior_a": np.array([p.a for p in posterior.priors]),
             "prior_b": np.array([p.b for p in posterior.priors])}
     data = {k: (("parameter",), v) for k, v in rows.items()}
-    return xarray.Dataset(data, coords={"parameter": list(posterior.names)}, attrs={"prior_kinds": ",".join(p.kind for p in posterior.priors)})
+    return xarray.Dataset(data, coords={"parameter": list(posterior.names)},
+                          attrs={"prior_kinds": ",".join(p.kind for p in posterior.priors)})
 
 
 def _likelihood_groups(likelihood: Likelihood, chains: NDArray[np.float64], most: int, xarray: Any) -> dict[str, Any]:
@@ -116,8 +118,10 @@ def _likelihood_groups(likelihood: Likelihood, chains: NDArray[np.float64], most
     some = chains[::walkers, step - 1::step]
     values = likelihood.by_block(some.reshape(-1, chains.shape[2])).reshape(*some.shape[:2], -1)
     problem = likelihood.problem
-    coords = {"chain": np.arange(0, chains.shape[0], walkers), "draw": np.arange(step - 1, chains.shape[1], step), "block": list(likelihood.blocks)}
+    coords = {"chain": np.arange(0, chains.shape[0], walkers), "draw": np.arange(step - 1, chains.shape[1], step),
+              "block": list(likelihood.blocks)}
     entry = {"frequency": ("entry", problem.frequency), "equation": ("entry", problem.equation), "record": ("entry", problem.record)}
     return {"log_likelihood": xarray.Dataset({"blocks": (("chain", "draw", "block"), values)}, coords=coords),
             "observed_data": xarray.Dataset({"inertia_less_force": ("entry", problem.observed.inertia)}, coords=entry,
-                                            attrs={"meaning": "in-band real Fourier coefficients of a - force, Eq. 13", "units": "kg^0.5 m/s^2"})}
+                                            attrs={"meaning": "in-band real Fourier coefficients of a - force, Eq. 13",
+                                                   "units": "kg^0.5 m/s^2"})}

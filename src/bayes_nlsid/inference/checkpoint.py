@@ -85,8 +85,10 @@ def identity(target: Target, starts: list[tuple[NDArray[np.float64], NDArray[np.
     problem = target.problem
     digest = hashlib.sha256()
     words = [list(problem.names), target.likelihood.describe(), [repr(p) for p in target.priors], problem.scenario.name,
-             [(e.term.name, e.term.formula, list(e.locations), e.tied, e.excess, list(e.fixed)) for e in problem.model.elements], list(numbers)]
+             [(e.term.name, e.term.formula, list(e.locations), e.tied, e.excess, list(e.fixed)) for e in problem.model.elements],
+             list(numbers)]
     digest.update(json.dumps(words, sort_keys=True, default=str).encode())
-    for array in (problem.bounds, target.coordinates.scale, problem.base, problem.columns, target.likelihood.weights, *(x for pair in starts for x in pair)):
+    for array in (problem.bounds, target.coordinates.scale, problem.base, problem.columns, target.likelihood.weights,
+                  *(x for pair in starts for x in pair)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

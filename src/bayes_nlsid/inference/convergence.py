@@ -179,7 +179,8 @@ def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str]
     if converged:
         reasons += _identification_reasons(draws, names, nonlinear, prior_sd, contraction, piled)
     status = "not_converged" if not converged else "ok" if identifiable.all() else "not_identifiable"
-    return Convergence(m, n, w, converged, float(np.max(rhat, initial=1.0)) if m > 1 else float("nan"), float(np.min(ess, initial=np.inf)) if p else 0.0,
+    return Convergence(m, n, w, converged, float(np.max(rhat, initial=1.0)) if m > 1 else float("nan"),
+                       float(np.min(ess, initial=np.inf)) if p else 0.0,
                        redrawn + int(still.sum()), rhat, tau, ess, acceptance, contraction, piled, identifiable, status, tuple(reasons))
 
 
@@ -191,7 +192,8 @@ def _convergence_reasons(names: Sequence[str], n: int, tau: Array, rhat: Array, 
         worst = float(np.nanmax(rhat))
         apart_text = ", ".join(apart)
         if worst > 1.1 and n > LENGTH * np.min(tau):
-            reasons.append(f"the ensembles disagree on {apart_text} (nested R-hat {worst:.3g}): several modes, or not enough steps to travel between them")
+            reasons.append(f"the ensembles disagree on {apart_text} (nested R-hat {worst:.3g}): several modes, or not enough steps to "
+                           f"travel between them")
         else:
             reasons.append(f"nested R-hat of {apart_text} is above {RHAT} (largest {worst:.4g})")
     elif len(acceptance) < 2:
@@ -209,7 +211,8 @@ def _convergence_reasons(names: Sequence[str], n: int, tau: Array, rhat: Array, 
     return reasons
 
 
-def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Sequence[bool], prior_sd: Array, contraction: Array, piled: Array) -> list[str]:
+def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Sequence[bool], prior_sd: Array, contraction: Array,
+                            piled: Array) -> list[str]:
     """Parameters at their bounds, and directions in which the posterior is as wide as the prior, in words."""
     reasons = [f"{name} is at a bound of its range in {100 * share:.0f} % of the draws: a one-sided statement, or a bound to widen"
                for name, share in zip(names, piled, strict=True) if share > PILED]
@@ -226,7 +229,7 @@ def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Seque
         shared = _tied(scaled, loaded)
         if len(shared) > 1:
             reasons.append(f"{_together([names[judged[i]] for i in shared])} enter only through one number (correlation "
-                           f"{np.corrcoef(scaled[:, shared[0]], scaled[:, shared[1]])[0, 1]:.2f}): read that combination, not the parts")
+                           f"{_correlation(scaled[:, shared[0]], scaled[:, shared[1]]):.2f}): read that combination, not the parts")
             told |= set(shared)
     for i, k in enumerate(judged):
         if contraction[k] < CONTRACTION and i not in told:
@@ -234,13 +237,16 @@ def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Seque
     return reasons
 
 
+def _correlation(a: Array, b: Array) -> float:
+    return float(np.mean((a - a.mean()) * (b - b.mean())) / (a.std() * b.std()))
+
+
 def _tied(scaled: Array, loaded: list[int]) -> list[int]:
     """Of the entries loaded on one wide direction, those that are known together though not apart: correlated beyond 0.9."""
     if len(loaded) < 2:
         return []
-    correlation = np.corrcoef(scaled[:, loaded].T)
-    first = 0
-    return [loaded[j] for j in range(len(loaded)) if j == first or abs(correlation[first, j]) > 0.9]
+    first = scaled[:, loaded[0]]
+    return [loaded[0], *(i for i in loaded[1:] if abs(_correlation(first, scaled[:, i])) > 0.9)]
 
 
 def _together(names: list[str]) -> str:

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 def seeded(child: np.random.SeedSequence) -> tuple[Any, ...]:
     """State of the generator that emcee uses (Mersenne twister), from a spawned seed sequence."""
-    return np.random.RandomState(np.random.MT19937(child)).get_state(legacy=True)  # type: ignore[return-value]
+    return tuple(np.random.RandomState(np.random.MT19937(child)).get_state(legacy=True))
 
 
 @cache
@@ -46,7 +46,7 @@ def _snooker_class() -> type:
     """The snooker move as a move of emcee, made when emcee is first needed."""
     from emcee.moves import RedBlueMove
 
-    class Snooker(RedBlueMove):  # type: ignore[misc]
+    class Snooker(RedBlueMove):
         """Along the line to an anchor, by the difference of two other walkers projected on it (ter Braak and Vrugt 2008)."""
 
         def __init__(self) -> None:
@@ -91,7 +91,8 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
     """
     import emcee
 
-    count, where = [0], []
+    count: list[int] = [0]
+    where: list[Array] = []
 
     interrupted = [False]
 
@@ -134,8 +135,8 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
            workers: int = 1) -> Posterior:
     """Draw from the posterior of a fitted problem.
 
-    Burn-in ends after ten autocorrelation times (at least 400 steps, at most a quarter of ``most``). During it walkers that stand still or lie
-    far below their ensemble are re-drawn from the others and counted; after it nothing is touched. Then every ensemble goes on until
+    Burn-in ends after ten autocorrelation times (at least 400 steps, at most a quarter of ``most``). During it walkers that stand still
+    or lie far below their ensemble are re-drawn from the others and counted; after it nothing is touched. Then every ensemble goes on until
     all parameters have nested R-hat ≤ 1.01, a chain of 50 autocorrelation times and 400 effective samples, or ``most`` steps are done.
 
     Parameters
@@ -186,7 +187,8 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
     if size == 0:
         raise ValueError("the problem has no free parameters; free a mode or add an element")
     if count < max(2 * size, 8) or count % 2 or ensembles < 1 or block < 10 or workers < 1 or most < block:
-        raise ValueError(f"walkers {count} must be even and at least {max(2 * size, 8)}, ensembles {ensembles} and workers {workers} at least 1, "
+        raise ValueError(f"walkers {count} must be even and at least {max(2 * size, 8)}, ensembles {ensembles} and workers {workers} at "
+                         f"least 1, "
                          f"block {block} at least 10, most {most} at least one block")
     first, second, third = np.random.SeedSequence(seed).spawn(3)
     starts = first_walkers(target, centres(target, starting_fits(fit, chosen)), count, first.spawn(ensembles))

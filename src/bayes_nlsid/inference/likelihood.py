@@ -83,7 +83,8 @@ class GaussianResidual:
 
     def __post_init__(self) -> None:
         if self.variance.shape != (self.problem.size,) or not (np.isfinite(self.variance).all() and (self.variance > 0).all()):
-            raise ValueError(f"variance must be ({self.problem.size},), finite and positive; noise-free data carry no likelihood, state a noise")
+            raise ValueError(f"variance must be ({self.problem.size},), finite and positive; noise-free data carry no likelihood, state "
+                             f"a noise")
         information = np.array([s.information for s in self.problem.observed.spectra])[self.problem.record]
         object.__setattr__(self, "weights", information / self.variance)
         object.__setattr__(self, "offset", -0.5 * information * np.log(2 * np.pi * self.variance))
@@ -147,13 +148,14 @@ def _rows(theta: ArrayLike) -> NDArray[np.float64]:
 def frequency_blocks(problem: Problem, per_cell: int = 8) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Blocks of neighbouring frequencies: index (N,) and names, ``per_cell`` for every equation of every recording."""
     index = np.empty(problem.size, dtype=np.intp)
-    names = []
+    names: list[str] = []
     for cell in problem.cells:
         count = min(per_cell, cell.bins)
         within = np.arange(cell.bins) * count // cell.bins
         index[cell.entries] = len(names) + np.tile(within, 2)
         frequency = problem.frequency[cell.entries][:cell.bins]
-        names += [f"{problem.data[cell.record].name}, mode {cell.equation + 1}, {frequency[within == b][0]:.4g}-{frequency[within == b][-1]:.4g} Hz"
+        names += [f"{problem.data[cell.record].name}, mode {cell.equation + 1}, "
+                  f"{frequency[within == b][0]:.4g}-{frequency[within == b][-1]:.4g} Hz"
                   for b in range(count)]
     return index, tuple(names)
 
@@ -164,8 +166,9 @@ class WhittleLikelihood(Likelihood):
 
     The spectrum is estimated per recording and equation from the residual of a fit (``noise.smoothed_variance``), the fit is repeated
     with its inverse as weights, the spectrum taken again from that, and then held fixed. It is never put below the sensor noise that the
-    recordings state. Smoothness: a Hann window of ``width`` frequencies to each side. The estimated variance has few degrees of freedom and was
-    taken from the same residual, which the fit made smaller: it is raised by N/(N − P) per fit and, for its own uncertainty, by ν/(ν − 2).
+    recordings state. Smoothness: a Hann window of ``width`` frequencies to each side. The estimated variance has few degrees of freedom
+    and was taken from the same residual, which the fit made smaller: it is raised by N/(N − P) and, for its own uncertainty, by
+    ν/(ν − 2).
 
     Conservative under sensor noise, slightly short (85 % for nominal 90 %) under unmeasured force, for single-mode data band-limited and
     high-passed at half the lowest elastic frequency or above; wrong when force laws are missing, which ``mismatch`` must test.
@@ -226,7 +229,8 @@ class WhittleLikelihood(Likelihood):
 
     def describe(self) -> str:
         """In words."""
-        return (f"Whittle likelihood of the in-band residual of Eq. 13, {self.problem.size} Fourier coefficients; variance from its own spectrum, "
+        return (f"Whittle likelihood of the in-band residual of Eq. 13, {self.problem.size} Fourier coefficients; variance from its own "
+                f"spectrum, "
                 f"smoothed over {self.width} frequencies to each side ({freedom(self.width):.0f} degrees of freedom), held at the fit")
 
 
@@ -275,7 +279,8 @@ class PlainLikelihood(Likelihood):
 
     def describe(self) -> str:
         """In words."""
-        return f"independent Gaussian residual of Eq. 13, one variance per recording and equation, {self.problem.size} Fourier coefficients (the paper's regression)"
+        return (f"independent Gaussian residual of Eq. 13, one variance per recording and equation, {self.problem.size} Fourier "
+                "coefficients (the paper's regression)")
 
 
 def whittle_variance(problem: Problem, theta: NDArray[np.float64], width: int = WIDTH) -> NDArray[np.float64]:
@@ -295,7 +300,8 @@ def _gaussian(problem: Problem, variance: NDArray[np.float64], theta: NDArray[np
     return GaussianResidual(problem, variance, theta, frequency_blocks(problem)[0])
 
 
-def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64], coordinates: Coordinates | None = None) -> NDArray[np.float64]:
+def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64],
+            coordinates: Coordinates | None = None) -> NDArray[np.float64]:
     """Covariance (P, P) around theta: information of the likelihood plus that of the prior, 1/sd² (P,), so that it always exists.
 
     In the given coordinates, None: those of the problem; ``prior_sd`` must be in the same.

@@ -120,7 +120,8 @@ class Posterior:
         c = self.convergence
         arrays = {f.name: getattr(c, f.name) for f in fields(c) if isinstance(getattr(c, f.name), np.ndarray)}
         plain = {f.name: getattr(c, f.name) for f in fields(c) if not isinstance(getattr(c, f.name), np.ndarray)}
-        meta = {"format": FORMAT, "names": self.names, "units": self.units, "seed": self.seed, "likelihood": self.likelihood, "burn": self.burn,
+        meta = {"format": FORMAT, "names": self.names, "units": self.units, "seed": self.seed, "likelihood": self.likelihood,
+                "burn": self.burn,
                 "failures": self.failures, "priors": [asdict(p) for p in self.priors], "convergence": plain}
         write_npz(Path(path), theta=self.theta, log_prob=self.log_prob, failed_at=self.failed_at, meta=np.array(json.dumps(meta)),
                   **{f"convergence_{k}": v for k, v in arrays.items()})
@@ -142,11 +143,13 @@ def load(path: Path | str) -> Posterior:
             raise KeyError(f"format {meta['format']}")
         diagnostics = {k.removeprefix("convergence_"): v for k, v in arrays.items() if k.startswith("convergence_")}
         plain = meta["convergence"] | {"reasons": tuple(meta["convergence"]["reasons"])}
-        return Posterior(tuple(meta["names"]), tuple(meta["units"]), arrays["theta"], arrays["log_prob"], Convergence(**plain, **diagnostics),
+        return Posterior(tuple(meta["names"]), tuple(meta["units"]), arrays["theta"], arrays["log_prob"],
+                         Convergence(**plain, **diagnostics),
                          tuple(Prior(**p) for p in meta["priors"]), meta["seed"], meta["likelihood"], meta["burn"], meta["failures"],
                          arrays["failed_at"])
     except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), f"cannot be read as a posterior ({error})", "sample again, or name a file written by Posterior.save") from error
+        raise InputError(str(path), f"cannot be read as a posterior ({error})",
+                         "sample again, or name a file written by Posterior.save") from error
 
 
 def write_npz(path: Path, **arrays: ArrayLike) -> None:

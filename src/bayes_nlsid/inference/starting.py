@@ -44,8 +44,8 @@ def first_walkers(target: Target, middle: Array, count: int, seeds: list[np.rand
     """Positions (W, P) in s and log densities (W,) for every ensemble.
 
     Each walker takes one of the optima at random and a step from a normal distribution of twice the local covariance (information of the
-    likelihood plus that of the prior, so that it exists in every direction). A step that leaves the bounds or meets zero density is drawn again,
-    shorter each time.
+    likelihood plus that of the prior, so that it exists in every direction). A step that leaves the bounds or meets zero density is drawn
+    again, shorter each time.
 
     Raises
     ------
