@@ -213,3 +213,69 @@ def test_progress_line_and_log(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (12.4, "12 s"), (75, "1 min 15 s"), (7200, "2 h 0 min")])
 def test_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+SAMPLED = """
+[posterior]
+ensembles = 2
+steps = 200
+[prediction]
+at = "x"
+amplitude = "1 mm"
+samples = 4
+draws = 10
+heldout = ["later part"]
+"""
+
+WITHIN = """
+import os, sys
+from pathlib import Path
+from bayes_nlsid.study import context, run
+from bayes_nlsid.study.reading import read_study
+calls = 0
+def killing(self, share, sentence):
+    global calls
+    calls += sentence.startswith(sys.argv[3])
+    if calls == int(sys.argv[4]):
+        os.kill(os.getpid(), 9)
+run.Reporter.update = killing
+run.run_study(read_study(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+@pytest.fixture(scope="module")
+def sampled(small: Path) -> Path:
+    path = small.with_name("sampled.toml")
+    path.write_text(small.read_text(encoding="utf-8") + SAMPLED, encoding="utf-8")
+    return path
+
+
+@pytest.mark.slow
+def test_kill_inside_the_sampler_and_the_prediction(sampled: Path, tmp_path: Path) -> None:
+    """Killed after a block of the sampler, then in the middle of the prediction: the same numbers as without interruption, and with two
+    workers as with one."""
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    run_study(read_study(sampled), whole)
+    for word, count in (("burn-in", 2), ("sampling", 1), ("predicting", 1)):
+        done = subprocess.run([sys.executable, "-c", WITHIN, str(sampled), str(broken), word, str(count)], env=ENVIRONMENT, check=False)
+        assert done.returncode == -9, (word, done.returncode)
+    run_study(read_study(sampled), broken, workers=2)
+    assert timeless(broken) == timeless(whole)
+    for stage in ("posterior", "predict"):
+        with np.load(broken / "stages" / stage / "arrays.npz") as a, np.load(whole / "stages" / stage / "arrays.npz") as b:
+            for key in set(a.files) - {"netcdf"}:
+                np.testing.assert_array_equal(a[key], b[key], err_msg=f"{stage} {key}")
+    assert {"posterior.nc", "backbone.npz"} <= {p.name for p in whole.iterdir()}
+    assert not list((broken / "stages").glob(".*"))
+
+
+@pytest.mark.slow
+def test_the_exported_posterior_is_the_one_that_was_sampled(sampled: Path, tmp_path: Path) -> None:
+    import arviz
+
+    run_study(read_study(sampled), tmp_path)
+    data = arviz.from_netcdf(str(tmp_path / "posterior.nc"))
+    assert {"posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data"} <= set(data.groups())
+    rows = {p["name"]: p for p in json.loads((tmp_path / "result.json").read_text())["parameters"]}
+    middle = float(np.median(data.posterior["f[1]"].values))
+    assert middle == pytest.approx(rows["f[1]"]["q50"], rel=1e-12)

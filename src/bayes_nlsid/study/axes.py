@@ -37,6 +37,17 @@ def prefixed(values: ArrayLike, unit: str) -> tuple[float, str]:
     return 1.0 / best[0], best[1] + unit_sign(unit)
 
 
+def scaled(values: ArrayLike, unit: str) -> tuple[float, str]:
+    """Like `prefixed`, and for units without prefixes a power of ten: (1e-6, "10⁶ N/m³"), so that no axis needs an offset."""
+    factor, sign = prefixed(values, unit)
+    array = np.abs(np.asarray(values, dtype=float))
+    largest = float(array[np.isfinite(array)].max(initial=0.0))
+    if unit in _PREFIXABLE or largest == 0.0 or 1e-2 <= largest < 1e4:
+        return factor, sign
+    power = 3 * int(np.floor(np.log10(largest) / 3))
+    return 10.0**-power, f"10{str(power).translate(_RAISED)} {sign}".strip()
+
+
 def axis_label(what: str, unit: str) -> str:
     """``what (unit)``, or just ``what`` for a pure number."""
     return f"{what} ({unit})" if unit else what

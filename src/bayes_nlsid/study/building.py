@@ -37,7 +37,8 @@ def build_structure(entry: StructureEntry) -> Structure | ModalModel:
         return oscillator(**values)
     from bayes_nlsid.structure.matrices import read_matrices
 
-    return read_matrices(**dict(entry.files), **values)
+    files: dict[str, Any] = dict(entry.files)
+    return read_matrices(**files, **values)
 
 
 def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -> ModalModel:
@@ -117,5 +118,6 @@ def model_record(model: ModalModel) -> tuple[dict[str, NDArray[Any]], dict[str, 
 
 def model_from(arrays: Mapping[str, NDArray[Any]], names: Mapping[str, Any]) -> ModalModel:
     """A modal model from `model_record`."""
-    return ModalModel(**{name: np.asarray(arrays[f"model.{name}"], dtype=float) for name in _MODEL_ARRAYS},
-                      residual=arrays.get("model.residual"), **{name: tuple(names[name]) for name in _MODEL_NAMES})
+    values: dict[str, Any] = {name: np.asarray(arrays[f"model.{name}"], dtype=float) for name in _MODEL_ARRAYS}
+    values |= {name: tuple(names[name]) for name in _MODEL_NAMES}
+    return ModalModel(**values, residual=arrays.get("model.residual"))

@@ -58,26 +58,29 @@ def _pictures(found: Diagnosis) -> dict[str, tuple[bytes, str]]:
     f: Mapping[str, Any] = found.figures
     out: dict[str, tuple[bytes, str]] = {}
     if "hypothesis_names" in f:
-        image = png(draw.hypotheses, f["hypothesis_names"].tolist(), f["hypothesis_probability"], f.get("place_names", np.array([])).tolist(),
+        places = np.asarray(f.get("place_names", np.array([], dtype=str)))
+        image = png(draw.hypotheses, f["hypothesis_names"].tolist(), f["hypothesis_probability"], places.tolist(),
                     f.get("place_share", np.zeros(0)))
         out["hypotheses"] = (image, "Probability of every explanation that was weighed, and how much of the mismatch a free force at each "
                                     "place would explain.")
     latents = [{"place": str(f["place_names"][i]), **{k: f[f"latent_{i}_{k}"] for k in ("force", "displacement", "velocity")}}
                for i in range(3) if f"latent_{i}_force" in f]
     if latents:
-        out["latent_force"] = (png(draw.latent_forces, latents), "The force that would explain the mismatch at the likeliest places, recovered "
-                               "without assuming its law, against displacement and velocity there.")
+        out["latent_force"] = (png(draw.latent_forces, latents), "The force that would explain the mismatch at the likeliest places, "
+                               "recovered without assuming its law, against displacement and velocity there.")
     if "frf_measured" in f:
         image = png(draw.transfer_functions, f["frf_frequency"], f["frf_measured"], f["frf_linear"], f["frequency"], f["residual_by_line"],
                     f["noise_by_line"])
-        out["transfer_function"] = (image, "Measured transfer function against the re-tuned linear model, and what is left against the noise.")
+        out["transfer_function"] = (image, "Measured transfer function against the re-tuned linear model, and what is left against "
+                                           "the noise.")
     waves = {k: np.asarray(f[f"heldout_{k}"], dtype=float) for k in ("measured", "nominal", "updated", "extended") if f"heldout_{k}" in f}
     if "measured" in waves:
         facts = ", ".join(f"{name} {100 * found.heldout[key]:.3g} %" for name, key in (
             ("NRMSE as delivered", "nrmse_nominal"), ("re-tuned", "nrmse_updated_linear"), ("extended", "nrmse_extended"))
             if found.heldout.get(key) is not None)
-        out["before_after"] = (png(draw.before_after, f["heldout_time"], waves, facts), "A record that was not used: the error of the model as "
-                               "delivered, of the best model without new physics, and with what was found, all on one scale.")
+        out["before_after"] = (png(draw.before_after, f["heldout_time"], waves, facts), "A record that was not used: the error of the "
+                               "model as delivered, "
+                               "and on a finer scale that of the best model without new physics and with what was found.")
     return out
 
 

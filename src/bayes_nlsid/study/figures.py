@@ -22,11 +22,12 @@ from bayes_nlsid.study.axes import axis_label, prefixed
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#6b6b6b"
 CYCLE = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY)
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9.5, "axes.labelsize": 9, "legend.fontsize": 8,
     "xtick.labelsize": 8, "ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
     "grid.color": "#e3e3e3", "grid.linewidth": 0.6, "axes.axisbelow": True, "lines.linewidth": 1.3, "legend.frameon": False,
-    "figure.facecolor": "white", "axes.titlelocation": "left", "axes.formatter.limits": (-4, 5), "axes.formatter.use_mathtext": True,
+    "figure.facecolor": "white", "axes.titlelocation": "left",
+    "axes.formatter.limits": (-4, 5), "axes.formatter.use_mathtext": True, "axes.formatter.useoffset": False,
 }
 WIDTH = 7.2
 DPI = 170

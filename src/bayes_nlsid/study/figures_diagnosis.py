@@ -24,11 +24,12 @@ def hypotheses(names: Sequence[str], probability: Array, places: Sequence[str], 
     left.barh(at, 100 * probability[order], color=BLUE, height=0.6)
     for row, i in enumerate(order):
         left.text(100 * probability[i] + 1, row, f"{100 * probability[i]:.0f} %", va="center", fontsize=7.5)
-    left.set(yticks=at, yticklabels=[names[i] for i in order], ylim=(len(order) - 0.4, -0.6), xlim=(0, 112), xlabel="probability (%)")
+    left.set(yticks=at, yticklabels=[names[i].replace("@-", "").replace("@", " at ") for i in order], ylim=(len(order) - 0.4, -0.6),
+             xlim=(0, 112), xlabel="probability (%)")
     at = np.arange(len(where))
     right.barh(at, 100 * shares[where], color=ORANGE, height=0.6)
     right.set(yticks=at, yticklabels=[places[i] for i in where], ylim=(max(len(where), 1) - 0.4, -0.6), xlim=(0, 105),
-              xlabel="share a free force there would explain (%)")
+              xlabel="explained by a free force there (%)")
     return figure
 
 
@@ -97,7 +98,8 @@ def before_after(time: Array, waves: Mapping[str, Array], facts: str) -> Figure:
         One line of numbers.
     """
     c = int(np.argmax(waves["measured"].std(axis=0)))
-    names = [("nominal", "model as delivered", GREY), ("updated", "linear model, re-tuned", ORANGE), ("extended", "with what was found", BLUE)]
+    names = [("nominal", "model as delivered", GREY), ("updated", "linear model, re-tuned", ORANGE),
+             ("extended", "with what was found", BLUE)]
     shown = [entry for entry in names if entry[0] in waves]
     figure, grid = canvas(1 + len(shown), 1, height=1.0 + 1.05 * (1 + len(shown)), sharex=True)
     measured = waves["measured"][:, c]
@@ -109,8 +111,11 @@ def before_after(time: Array, waves: Mapping[str, Array], facts: str) -> Figure:
         grid[row][0].plot(time, factor * (measured - waves[name][:, c]), color=color, linewidth=0.6)
         grid[row][0].set_ylabel(f"error ({unit})", fontsize=8)
         grid[row][0].set_title(words, fontsize=8.5, pad=2)
-    for axes in grid[:, 0]:
-        axes.set(ylim=(-size, size), xlim=(time[0], time[-1]))
+    left = [factor * float(np.abs(measured - waves[n][:, c]).max()) for n, _, _ in shown if n != "nominal"]
+    fine = 1.05 * max(left, default=size) or size
+    for row, axes in enumerate(grid[:, 0]):
+        common = row == 0 or shown[row - 1][0] == "nominal"  # the two best share a finer scale
+        axes.set(ylim=(-size, size) if common else (-fine, fine), xlim=(time[0], time[-1]))
     grid[-1][0].set_xlabel("time (s)")
     figure.suptitle(f"sensor {c + 1}   {facts}", x=0.01, ha="left", fontsize=8.5)
     return figure

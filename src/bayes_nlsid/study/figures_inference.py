@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from bayes_nlsid.study.axes import prefixed, short_names
+from bayes_nlsid.study.axes import scaled, short_names
 from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, RED, canvas
 
 Array = NDArray[np.float64]
@@ -101,11 +101,11 @@ def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str]
         if i >= count:
             axes.set_axis_off()
             continue
-        factor, unit = prefixed(np.quantile(np.abs(draws[:, i]), [0.5]), units[i])
+        factor, unit = scaled(np.quantile(np.abs(draws[:, i]), [0.5]), units[i])
         values = factor * draws[:, i]
         low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
         span = np.quantile(values, [0.001, 0.999]) + np.array([-0.05, 0.05]) * max(np.ptp(values), 1e-12 * abs(middle) + 1e-300)
-        bins = np.linspace(*span, 45)
+        bins = np.linspace(float(span[0]), float(span[1]), 45)
         axes.hist(values, bins=bins, density=True, color=BLUE, alpha=0.75, label="posterior")
         if prior is not None:
             inside = factor * prior[:, i]
@@ -144,8 +144,8 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
             if j > i:
                 axes.set_axis_off()
                 continue
-            fx, ux = prefixed(np.quantile(np.abs(draws[:, column]), [0.5]), units[column])
-            fy, uy = prefixed(np.quantile(np.abs(draws[:, row]), [0.5]), units[row])
+            fx, ux = scaled(np.quantile(np.abs(draws[:, column]), [0.5]), units[column])
+            fy, uy = scaled(np.quantile(np.abs(draws[:, row]), [0.5]), units[row])
             if i == j:
                 axes.hist(fx * draws[:, row], bins=40, color=BLUE, alpha=0.75)
                 axes.set_yticks([])
@@ -193,7 +193,7 @@ def convergence(log_probability: Array, chains: Array, names: Sequence[str], uni
         color, label = CYCLE[m % len(CYCLE)], f"ensemble {m + 1}"
         grid[0][0].plot(steps, np.median(log_probability[m], axis=1), color=color, label=label, linewidth=0.9)
         for row, i in enumerate(chosen):
-            factor, unit = prefixed(np.quantile(np.abs(chains[..., i]), [0.5]), units[i])
+            factor, unit = scaled(np.quantile(np.abs(chains[..., i]), [0.5]), units[i])
             quantiles = factor * np.quantile(chains[m, :, :, i], [0.05, 0.5, 0.95], axis=1)
             axes = grid[row + 1][0]
             axes.fill_between(steps, quantiles[0], quantiles[2], color=color, alpha=0.15, linewidth=0)

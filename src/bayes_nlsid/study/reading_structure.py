@@ -49,7 +49,8 @@ def _beam(table: Table) -> StructureEntry:
     values: dict[str, Any] = {}
     for spec in fields(LappedBeam):
         name = spec.name
-        default = None if spec.default is not MISSING else _required(table, name)
+        if spec.default is MISSING and not table.has(name):
+            table.raw(name)  # raises the sentence of a missing key
         if name in _PLACES:
             value: Any = _positions(table, name)
         elif name in ("boundary", "side"):
@@ -60,22 +61,16 @@ def _beam(table: Table) -> StructureEntry:
             value = tuple((t.text("name"), t.number("at", "length"), t.number("mass", "mass"))
                           for t in _closing(table, name, ("name", "at", "mass")))
         elif name in _SERIES:
-            value = table.numbers(name, _DIMENSION[name], default)
+            value = table.numbers(name, _DIMENSION[name], None)
         elif name in _SPRINGS:
             value = _springs(table, name)
         else:
-            value = table.number(name, _DIMENSION.get(name, "number"), default)
+            value = table.number(name, _DIMENSION.get(name, "number"), None)
         if value is not None and value != ():
             values[name] = value
     if "lap" in values and len(values["lap"]) != 2:
         raise table.wrong("lap", f"{len(values['lap'])} values are given", "write lap = [start, end]")
     return StructureEntry("beam", tuple(values.items()))
-
-
-def _required(table: Table, name: str) -> None:
-    """Raise the sentence of a missing key."""
-    if not table.has(name):
-        table.raw(name)
 
 
 def _closing(table: Table, key: str, known: tuple[str, ...]) -> list[Table]:

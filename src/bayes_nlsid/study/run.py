@@ -124,7 +124,7 @@ def _write_backbone(saved: Saved, path: Path) -> None:
     arrays = {name: saved.arrays[name] for name in wanted}
     arrays |= {name.replace("measured.", "measured_"): a for name, a in saved.arrays.items() if name.startswith("measured.")}
     buffer = BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_atomic(path, buffer.getvalue())
 
 

@@ -137,7 +137,7 @@ class PriorEntry:
     """
 
     parameter: str
-    kind: str
+    kind: Literal["normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal"]
     a: float = 0.0
     b: float = 1.0
     lower: float | None = None
@@ -172,7 +172,7 @@ class PredictionEntry:
     samples: int = 100
     seconds: float | None = None
     fs: float | None = None
-    scheme: str = "hht"
+    scheme: Literal["hht", "exponential"] = "hht"
     amplitudes: tuple[float, ...] = ()
     measured: str | None = None
     band: tuple[float, float] | None = None

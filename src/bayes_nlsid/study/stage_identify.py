@@ -174,8 +174,9 @@ def _record(name: str, found: Fit, linear: float, selection: Selection | None) -
     regression = float(problem.mse(found.theta)) if np.isfinite(found.theta).all() else found.mse
     record: dict[str, Any] = {
         "name": name, "elements": [element_record(e) for e in problem.model.elements], "names": list(problem.names),
-        "units": [p.unit for p in problem.model.parameters], "mse": regression, "mse_of_fit": found.mse, "mse_linear": linear, "floor": float(problem.floor),
-        "rank": found.rank, "status": found.status, "reasons": list(found.reasons), "samples": problem.samples,
+        "units": [p.unit for p in problem.model.parameters], "mse": regression, "mse_of_fit": found.mse, "mse_linear": linear,
+        "floor": float(problem.floor), "rank": found.rank,
+        "status": found.status, "reasons": list(found.reasons), "samples": problem.samples,
         "starts": [{"mse": s.mse, "status": s.status, "evaluations": s.evaluations, "seconds": s.seconds} for s in found.starts]}
     if selection is not None:
         record |= {

@@ -90,7 +90,7 @@ def _displacement(context: Context, recording: Recording, at: str) -> tuple[Arra
                          f"choose at among {', '.join(where)}")
     moved = kinematics(recording, band_of(context, context.model))
     part = moved.valid
-    return recording.dt * np.arange(recording.n)[part], moved.displacement[part, where.index(at)]
+    return recording.time[part], moved.displacement[part, where.index(at)]
 
 
 def _measured(context: Context, entry: PredictionEntry) -> Arrays:

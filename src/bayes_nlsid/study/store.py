@@ -230,7 +230,7 @@ class Store:
                 text = json.dumps(dict(data), default=_plain, allow_nan=True, indent=1)
                 (partial / "data.json").write_text(text, encoding="utf-8")
                 with (partial / "arrays.npz").open("wb") as file:
-                    np.savez(file, **{name: np.asarray(array) for name, array in arrays.items()})
+                    np.savez(file, **{name: np.asarray(array) for name, array in arrays.items()})  # type: ignore[arg-type]
                     file.flush()
                     os.fsync(file.fileno())
                 meta = {"format": FORMAT, "stage": stage, "key": key, "inputs": dict(inputs or {}), "versions": versions(),

@@ -123,7 +123,7 @@ def write_template(folder: Path) -> Path:
     except OSError as error:
         raise InputError(str(folder), f"cannot be made ({error.strerror})", "give another folder") from None
     buffer = BytesIO()
-    np.savez(buffer, **example_recording())
+    np.savez(buffer, **example_recording())  # type: ignore[arg-type]
     write_atomic(recording, buffer.getvalue())
     write_atomic(study, TEXT.encode())
     return study
