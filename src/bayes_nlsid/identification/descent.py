@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from bayes_nlsid.identification.elimination import Elimination, nonlinear_jacobian
 from bayes_nlsid.identification.problem import Problem
 
+FLAT = 1e-4   # share of the largest curvature that every direction of the unit box is given in the damping
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -105,16 +107,20 @@ class Descent:
         loose = ~(((point.x <= 0) & (gradient > 0)) | ((point.x >= 1) & (gradient < 0)))
         if not loose.any() or not np.any(gradient[loose]):
             return replace(point, status="converged", evaluations=spent)
-        scale = np.diag(curvature)[loose] + 1e-8 * np.max(np.diag(curvature)) + 1e-300
+        # Marquardt's scaling with a share of Levenberg's: without it the flat directions of a joint that hardly slips run to their bounds.
+        scale = np.diag(curvature)[loose] + FLAT * np.max(np.diag(curvature)) + 1e-300
         damping = point.damping
         for _ in range(12):
             step = np.zeros(len(self.free))
             step[loose] = -np.linalg.solve(curvature[np.ix_(loose, loose)] + damping * np.diag(scale), gradient[loose])
-            # A step of more than a third of the box is outside anything the linearisation knows.
-            step *= min(1.0, 1 / 3 / max(float(np.max(np.abs(step))), 1e-300))
-            trial = self.at(np.clip(point.x + step, 0.0, 1.0))
+            # More than a third of the box is outside anything the linearisation knows; each entry is cut by itself, lest one flat
+            # direction shorten the step in all others.
+            trial = self.at(np.clip(point.x + np.clip(step, -1 / 3, 1 / 3), 0.0, 1.0))
             spent += 1
             if trial.cost < point.cost:
-                return replace(trial, damping=max(damping / 5, 1e-12), evaluations=spent)
+                move = trial.x - point.x
+                foreseen = -float(2 * gradient @ move + move @ curvature @ move)
+                trusted = point.cost - trial.cost > 0.25 * foreseen
+                return replace(trial, damping=max(damping / 5, 1e-12) if trusted else 2 * damping, evaluations=spent)
             damping *= 4
         return replace(point, status="converged", evaluations=spent, damping=damping)
