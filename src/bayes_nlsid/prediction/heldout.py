@@ -127,7 +127,7 @@ def heldout(model: Model, draws: ArrayLike | Drawable, recording: Recording, *, 
     first = _start_samples(model, recording, band)
     steady = recording.period is not None and not recording.free
     how = "steady" if steady else start or _usual_start(recording, first)
-    keywords = {"scheme": scheme, "tolerance": tolerance, "compiled": compiled, "progress": progress}
+    keywords: dict[str, object] = {"scheme": scheme, "tolerance": tolerance, "compiled": compiled, "progress": progress}
     u0 = v0 = None
     if how == "estimate":
         sigma = float(np.median(floor.rms() / np.maximum(np.sqrt(np.mean(np.square(recording.response[:first]), axis=0)), 1e-300)))

@@ -28,8 +28,11 @@ EVEN_BATCH = 50
 class Stepper(Protocol):
     """What the driver needs of a time loop; see ``stepping.NumpyStepper``."""
 
-    iterations: NDArray[np.int64]
-    failures: NDArray[np.int64]
+    @property
+    def iterations(self) -> NDArray[np.int64]: ...
+
+    @property
+    def failures(self) -> NDArray[np.int64]: ...
 
     @property
     def displacement(self) -> Array: ...
@@ -106,7 +109,7 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     window = int(np.ceil(fs / (omega.min() / (2 * np.pi)) / every)) * every
     stored, status = _drive(request, stepper, window, stop_amplitude, skip)
     final = tuple(np.ascontiguousarray(a.T) for a in (stepper.displacement, stepper.velocity))
-    return Response(every / fs, request.keep, *stored, status=status, iterations=stepper.iterations.copy(), unconverged=stepper.failures.copy(),
+    return Response(every / fs, request.keep, stored[0], stored[1], stored[2], status=status, iterations=stepper.iterations.copy(), unconverged=stepper.failures.copy(),
                     scheme=scheme, period_error=period_error, false_damping=false_damping, final_displacement=final[0],
                     final_velocity=final[1], compiled=ran)
 
@@ -220,7 +223,7 @@ def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: flo
             if array is not None:
                 blocks[i].append(array)
         done += size
-        finite = np.isfinite(stepper.displacement).all(axis=0) & np.isfinite(stepper.acceleration).all(axis=0)
+        finite = np.asarray(np.isfinite(stepper.displacement).all(axis=0) & np.isfinite(stepper.acceleration).all(axis=0))
         status[~finite] = "diverged"
         if not finite.any():
             break

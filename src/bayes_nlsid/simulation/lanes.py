@@ -12,8 +12,8 @@ from bayes_nlsid.simulation.joints import PRELOAD_STEPS, Joints
 from bayes_nlsid.simulation.schemes import Steps
 
 Array = NDArray[np.float64]
-WIDEST = 64
-"""Lanes per block at most: more would not fit the first-level cache."""
+WIDEST = 128
+"""Lanes per block at most: fewer pay the fixed cost of every short loop too often, more would not fit the second-level cache."""
 VECTOR = 8
 ROOM = 16
 """Open reversals for which there is room at first."""
@@ -21,6 +21,7 @@ KINDS = {"none": 0, "masing": 1, "sliders": 2, "bouc_wen": 3}
 MOST_PARAMETERS = 6
 
 
+@final
 class Linear(NamedTuple):
     """Coefficients of one step (W = lanes or 1): a (m, c, c, W), old, new (m, c, W), sq and sv (R, R, W) with squares (R, R) of the first,
     b (R, m), bt (m, R), reach_q and reach_v (W,): row sums of sq and sv; damping, stiffness (m, W)."""
@@ -42,6 +43,7 @@ class Linear(NamedTuple):
     stiffness: Array
 
 
+@final
 class Elements(NamedTuple):
     """Entries (one law at one location): kind, code, power, row, fast (E,); p (E, lanes, 6); coefficient (E, 5, lanes); spring (E, lanes)."""
 
@@ -55,8 +57,9 @@ class Elements(NamedTuple):
     spring: Array
 
 
+@final
 class Memory(NamedTuple):
-    """Histories: last (E, lanes, 4), depth (E, lanes), ends and forces (E, lanes, room); the branch each Masing entry is on: origin, base, doubled,
+    """Histories: last (4, E, lanes), depth (E, lanes), ends and forces (E, lanes, room); the branch each Masing entry is on: origin, base, half,
     far (E, lanes); sliders of entry ``slot[e]``: theta (s, lanes), stiffness, slip, stretch, sliding (s, lanes, sliders)."""
 
     present: bool
@@ -68,7 +71,7 @@ class Memory(NamedTuple):
     forces: Array
     origin: Array
     base: Array
-    doubled: Array
+    half: Array
     far: Array
     slot: NDArray[np.int64]
     theta: Array
@@ -78,6 +81,7 @@ class Memory(NamedTuple):
     sliding: Array
 
 
+@final
 class Motion(NamedTuple):
     """State and buffers: x (c, m, lanes), f (m, lanes); joint forces of this and earlier steps (R, lanes); the rest is scratch."""
 
@@ -112,8 +116,8 @@ class Block:
         self.work = np.zeros((10, len(linear.b), len(which)))
 
     def advance(self, count: int, force: Array, rows: Array, every: int, outs: tuple[Array, Array, Array]) -> None:
-        """Run ``count`` steps; see ``compiled.advance``."""
-        from bayes_nlsid.simulation import compiled
+        """Run ``count`` steps; see ``compiled_loop.advance``."""
+        from bayes_nlsid.simulation import compiled_loop as compiled
 
         done = 0
         while True:
@@ -185,7 +189,7 @@ def _memory(joints: Joints, dt: float, which: NDArray[np.intp]) -> Memory:
     stiffness = np.stack([x[0] for x in made]) if made else np.zeros((0, lanes, 0))
     slip = np.stack([x[1] for x in made]) if made else np.zeros((0, lanes, 0))
     theta = np.stack([np.broadcast_to(x[2][:, 0], (lanes,)) for x in made]) if made else np.zeros((0, lanes))
-    return Memory(bool(joints.memory), dt, np.zeros((*shape, 4)), np.zeros(shape, dtype=np.int64), np.zeros(1, dtype=np.int64),
+    return Memory(bool(joints.memory), dt, np.zeros((4, *shape)), np.zeros(shape, dtype=np.int64), np.zeros(1, dtype=np.int64),
                   np.zeros((*shape, ROOM)), np.zeros((*shape, ROOM)), np.zeros(shape), np.zeros(shape), np.ones(shape), np.zeros(shape), slot,
                   theta, stiffness, slip, np.zeros_like(slip), np.zeros_like(slip))
 
@@ -199,7 +203,7 @@ def _motion(c: int, m: int, r: int, lanes: int) -> Motion:
 
     return Motion(np.zeros((c, m, lanes)), np.zeros((m, lanes)), joint(), joint(), joint(), joint(), joint(), joint(), joint(), np.zeros(lanes),
                   np.zeros(lanes), np.zeros(lanes), whole(), whole(), np.zeros(1, dtype=np.int64), np.zeros((c, m, lanes)), np.zeros((m, lanes)),
-                  np.zeros((m, lanes)), np.zeros((3, lanes)))
+                  np.zeros((m, lanes)), np.zeros((5, lanes)))
 
 
 @final
@@ -211,7 +215,7 @@ class CompiledStepper:
 
     def __init__(self, steps: Steps, joints: Joints, codes: list[tuple[int, float]], damping: Array, stiffness: Array, u: Array, v: Array,
                  p: Array | None) -> None:
-        from bayes_nlsid.simulation import compiled
+        from bayes_nlsid.simulation import compiled_loop as compiled
 
         self.samples = joints.samples
         self._blocks: list[Block] = []

@@ -75,7 +75,7 @@ class Response:
     @property
     def time(self) -> Array:
         """(n,) s."""
-        return self.dt * np.arange(self.n)
+        return np.asarray(self.dt * np.arange(self.n), dtype=float)
 
     @property
     def ok(self) -> NDArray[np.bool_]:

@@ -134,8 +134,8 @@ class NumpyStepper:
         b = joints.shapes
         modal = np.zeros_like(u) if p is None else np.broadcast_to(p[:, None] if p.ndim == 1 else p, u.shape)
         self.linear = Propagator(steps, b, samples, joints.velocity)
-        self.iterations = np.zeros(samples, dtype=np.int64)
-        self.failures = np.zeros(samples, dtype=np.int64)
+        self.iterations: NDArray[np.int64] = np.zeros(samples, dtype=np.int64)
+        self.failures: NDArray[np.int64] = np.zeros(samples, dtype=np.int64)
         q, w = b @ u, b @ v
         self.g = np.zeros_like(q)
         if joints.count:
@@ -280,6 +280,6 @@ def _solve(matrix: Array, e: Array) -> Array:
     if matrix.shape[-1] == 1:
         return e / matrix[:, 0, 0]
     try:
-        return np.linalg.solve(matrix, e.T[:, :, None])[:, :, 0].T
+        return np.asarray(np.linalg.solve(matrix, e.T[:, :, None])[:, :, 0].T, dtype=float)
     except np.linalg.LinAlgError:
         return e
