@@ -79,7 +79,7 @@ def _pictures(found: Diagnosis) -> dict[str, tuple[bytes, str]]:
             ("NRMSE as delivered", "nrmse_nominal"), ("re-tuned", "nrmse_updated_linear"), ("extended", "nrmse_extended"))
             if found.heldout.get(key) is not None)
         out["before_after"] = (png(draw.before_after, f["heldout_time"], waves, facts), "A record that was not used: the error of the "
-                               "model as delivered, and on a finer scale those of the best model without new physics and of the extended one.")
+                               "model as delivered, and on a finer scale those of the re-tuned and of the extended model.")
     return out
 
 
