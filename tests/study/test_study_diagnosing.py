@@ -19,10 +19,12 @@ def answer(verdict: str = "mismatch", figures: bool = True) -> Diagnosis:
     n, lines, sensors = 600, 80, 3
     parameter = {"name": "f_s", "unit": "N", "q05": 9.1, "q50": 10.0, "q95": 11.2}
     numbers: dict[str, Any] = {} if not figures else {
-        "frequency": np.arange(lines) + 1.0, "frf_frequency": np.arange(lines) + 1.0, "frf_measured": rng.standard_normal((lines, sensors)) + 0j,
+        "frequency": np.arange(lines) + 1.0, "frf_frequency": np.arange(lines) + 1.0,
+        "frf_measured": rng.standard_normal((lines, sensors)) + 0j,
         "frf_linear": rng.standard_normal((lines, sensors)) + 0j, "residual_by_line": rng.uniform(0.1, 1, lines),
         "noise_by_line": np.zeros(lines), "hypothesis_names": np.array(["hysteresis@J2_slip", "other@-", "none"]),
-        "hypothesis_probability": np.array([0.9, 0.07, 0.03]), "place_names": np.array(["J2_slip", "J1_slip"]), "place_share": np.array([0.9, 0.6]),
+        "hypothesis_probability": np.array([0.9, 0.07, 0.03]),
+        "place_names": np.array(["J2_slip", "J1_slip"]), "place_share": np.array([0.9, 0.6]),
         "heldout_time": np.arange(n) / 1000, **{f"latent_0_{k}": rng.standard_normal(n) for k in ("force", "displacement", "velocity")},
         **{f"heldout_{k}": rng.standard_normal((n, sensors)) for k in ("measured", "nominal", "updated", "extended")}}
     held = {"records": ["high_2"], "nrmse_nominal": 0.5, "nrmse_updated_linear": 0.2, "nrmse_extended": 0.02, "noise_floor": 0.01}
@@ -40,7 +42,8 @@ def test_everything_is_left(figures: bool, tmp_path: Path, monkeypatch: pytest.M
     assert {p.stem for p in (tmp_path / "out" / "figures").glob("*.png")} == (
         {"hypotheses", "latent_force", "transfer_function", "before_after"} if figures else set())
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    for words in ("case &lt;1&gt;", "hysteresis at J2_slip", "90.0 %", "9.10 N / 10.0 N / 11.2 N", "a test at ten times the level", "2 %", "one note"):
+    for words in ("case &lt;1&gt;", "hysteresis at J2_slip", "90.0 %", "9.10 N / 10.0 N / 11.2 N",
+                  "a test at ten times the level", "2 %", "one note"):
         assert words in page, words
     assert "http" not in page.replace("http-equiv", "")
 
