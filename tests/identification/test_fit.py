@@ -238,7 +238,7 @@ def test_selection_takes_nothing_from_a_linear_recording():
 def test_selection_tells_a_loop_from_a_spring():
     """Damping that grows with amplitude: the slider with memory wins over the same law without."""
     pool = [Element(LIBRARY[name], ("J1", "J2")) for name in ("jenkins", "jenkins_memory", "q|q|", "cubic")]
-    found = select(Problem(Model(beam(), (), (0,)), (slider_run(),), scenario("S2", 3, 0)), pool, starts=12, seed=1)
+    found = select(Problem(Model(beam(), (), (0,)), (slider_run(),), scenario("S2", 3, 0)), pool, starts=6, seed=1)
     assert [e.term.name for e in found.backward] == ["jenkins_memory"]
 
 

@@ -40,7 +40,7 @@ def settled(likelihood, start, **options):
     return sample(start, likelihood=likelihood, priors=flat_priors(start.problem), seed=3, most=4000, **options)
 
 
-@pytest.mark.parametrize("scale", [0.01, 100.0])
+@pytest.mark.parametrize("scale", [0.01, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_moves_leave_a_gaussian_as_it_is(scale):
     """Own snooker alone and the whole mix, whatever the unit: variance and mean of a 4-dimensional normal."""
     for chosen in ([(_snooker_class()(), 1.0)], moves()):
@@ -54,7 +54,7 @@ def test_moves_leave_a_gaussian_as_it_is(scale):
 
 def test_a_known_gaussian_is_recovered_and_a_wrong_one_is_not():
     start = lend(2)
-    found = settled(Written(start, gaussian), start)
+    found = settled(Written(start, gaussian), start, ensembles=2)
     x = found.flat / start.problem.bounds[:, 1]
     assert found.status == "ok" and found.convergence.rhat_max < 1.01 and found.convergence.ess_min > 400
     assert x.mean(axis=0) == pytest.approx([0.2, -0.1], abs=0.004)
@@ -74,10 +74,10 @@ def test_posterior_of_a_coefficient_in_closed_form():
     information = np.sum(w * column**2) + 1 / prior.b**2
     mean, sd = -np.sum(w * column * base) / information, information**-0.5
     assert abs(mean) < 0.5 * prior.upper      # truncation plays no part
-    found = sample(start, likelihood=likelihood, seed=1, most=3000)
+    found = sample(start, likelihood=likelihood, seed=1, ensembles=2, steps=600)
     assert found.status == "ok"
-    assert found.flat.mean() == pytest.approx(mean, abs=0.06 * sd)
-    assert found.flat.std() == pytest.approx(sd, rel=0.05)
+    assert found.flat.mean() == pytest.approx(mean, abs=0.1 * sd)
+    assert found.flat.std() == pytest.approx(sd, rel=0.08)
     assert abs(mean + 4e5) < 4 * sd
 
 
@@ -88,17 +88,17 @@ def test_the_posterior_does_not_depend_on_c():
     for c in (1.0, 20 * bound):
         start = lend(1, c)
         likelihood = Written(start, lambda x: -0.5 * ((x[:, 0] - 0.06) / 0.03) ** 2)
-        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=1200, most=2400)
+        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=600, most=1000)
         quantiles.append(found.quantiles([0.16, 0.5, 0.84])[:, 0] / start.problem.bounds[0, 1])
-        assert found.convergence.rhat_max < 1.02
+        assert found.convergence.rhat_max < 1.05
     sd = 0.5 * (quantiles[1][2] - quantiles[1][0])
     for other in quantiles:
-        assert other == pytest.approx(quantiles[0], abs=0.15 * sd)
+        assert other == pytest.approx(quantiles[0], abs=0.2 * sd)
 
 
 def test_resumed_runs_are_the_same_to_the_last_bit(tmp_path):
     start = lend(2)
-    options = {"steps": 600, "block": 100, "ensembles": 2}
+    options = {"steps": 300, "block": 100, "ensembles": 2}
     whole = settled(Written(start, gaussian), start, **options)
     calls = []
     part = settled(Written(start, gaussian), start, store=tmp_path, stop=lambda: calls.append(1) or len(calls) == 5, **options)
@@ -118,7 +118,7 @@ import sys
 from tests.inference.test_sampling import settled, slow
 from tests.inference.targets import Written, lend
 if __name__ == "__main__":
-    settled(Written(lend(2), slow), lend(2), store=sys.argv[1], steps=600, block=50, ensembles=2)
+    settled(Written(lend(2), slow), lend(2), store=sys.argv[1], steps=300, block=50, ensembles=2)
 """
 
 
@@ -138,9 +138,9 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     finally:
         process.wait()
     finished = len(list(tmp_path.glob("ensemble*.npz")))
-    assert 5 <= finished < 40
+    assert 5 <= finished < 28
     start = lend(2)
-    options = {"steps": 600, "block": 50, "ensembles": 2}
+    options = {"steps": 300, "block": 50, "ensembles": 2}
     assert np.array_equal(settled(Written(start, slow), start, store=tmp_path, **options).theta,
                           settled(Written(start, gaussian), start, **options).theta)
 
@@ -149,9 +149,9 @@ def test_workers_do_not_change_the_draws():
     elements = (Element(LIBRARY["q|q|"], ("J1",)), Element(LIBRARY["jenkins_memory"], ("J2",), fixed=(("k_t", 4000.0),)))
     problem = Problem(Model(beam(), elements), (run(2.0, 5, 1.0),), scenario("S2", 3, 0))
     start = fit(problem, starts=4)
-    one, two = (sample(start, seed=9, steps=100, block=50, ensembles=2, most=200, workers=w) for w in (1, 2))
+    one, two = (sample(start, seed=9, steps=50, block=50, ensembles=2, most=100, workers=w) for w in (1, 2))
     assert np.array_equal(one.theta, two.theta) and np.array_equal(one.log_prob, two.log_prob)
-    other = sample(start, seed=10, steps=100, block=50, ensembles=2, most=200)
+    other = sample(start, seed=10, steps=50, block=50, ensembles=2, most=100)
     assert not np.array_equal(one.theta, other.theta)
 
 
@@ -176,13 +176,14 @@ def test_two_modes_far_apart_are_flagged(monkeypatch):
 
     scatter = 1e-4 * np.random.default_rng(0).normal(size=(2, 20, 1))
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
-    same = settled(Written(start, two), start, ensembles=2, steps=600)
+    same = settled(Written(start, two), start, ensembles=2, steps=500)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
-    apart = settled(Written(start, two), start, ensembles=2, steps=600)
+    apart = settled(Written(start, two), start, ensembles=2, steps=500)
     assert same.status == "ok"
     assert apart.status == "not_converged" and any("disagree" in r for r in apart.reasons)
 
 
+@pytest.mark.slow
 def test_modes_that_can_be_reached_get_their_weight():
     """Nine to one, ten standard deviations apart: full-length differential moves travel between them."""
     start = lend(2)

@@ -14,7 +14,7 @@ from bayes_nlsid.identification.descent import Descent, Point
 from bayes_nlsid.identification.elimination import jacobian
 from bayes_nlsid.identification.problem import Problem
 
-SCREENING, SURVIVORS = 7, 12    # iterations given to every start, starts that go on to convergence
+SCREENING, SURVIVORS = 7, 8    # iterations given to every start, starts that go on to convergence
 
 
 @final
@@ -91,7 +91,7 @@ class Fit:
 
 
 def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[np.float64] | None = None,
-        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 100) -> Fit:
+        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 200) -> Fit:
     """Fit all parameters of a problem.
 
     Parameters

@@ -46,6 +46,7 @@ def _snooker_class() -> type:
     """The snooker move as a move of emcee, made when emcee is first needed."""
     from emcee.moves import RedBlueMove
 
+    @final
     class Snooker(RedBlueMove):
         """Along the line to an anchor, by the difference of two other walkers projected on it (ter Braak and Vrugt 2008)."""
 

@@ -82,6 +82,7 @@ class Target:
         return self.parts(np.asarray(s, dtype=float))[0]
 
 
+@final
 class _Pickler(pickle.Pickler):
     """Sends a term of the library as its name: its law may be a function made inside another, which pickle cannot name."""
 
