@@ -15,7 +15,8 @@ from tests.simulation.problems import IWAN, beam, oscillator
 def test_duffing_bands_follow_the_elliptic_integral() -> None:
     model = oscillator("cubic", zeta=0.004)
     draws = np.array([[2e4], [3e4], [4e4]])
-    bands = backbone_bands(draws, model, at="x", start_amplitude=0.1, amplitudes=np.array([0.03, 0.05, 0.08]), scheme="exponential", fs=2000)
+    bands = backbone_bands(draws, model, at="x", start_amplitude=0.1, amplitudes=np.array([0.03, 0.05, 0.08]), scheme="exponential",
+                           fs=2000)
     w2 = (2 * np.pi * 10) ** 2 + draws * bands.amplitude**2
     exact = np.sqrt(w2) / (4 * ellipk(draws * bands.amplitude**2 / (2 * w2)))
     assert np.abs(bands.samples_frequency - exact).max() < 2e-3

@@ -109,7 +109,8 @@ class Bands:
     def load(cls, path: str | Path) -> Bands:
         """Read what ``save`` wrote."""
         with np.load(Path(path), allow_pickle=False) as data:
-            frequency, damping = (np.stack([data[f"{name}_q{round(100 * level):02d}"] for level in LEVELS]) for name in ("frequency", "damping"))
+            frequency, damping = (np.stack([data[f"{name}_q{round(100 * level):02d}"] for level in LEVELS]) for name in ("frequency",
+                                                                                                                         "damping"))
             return cls(data["amplitude"], frequency, damping, data["samples_frequency"], data["samples_damping"],
                        data["numerical_error_frequency"], data["numerical_error_damping"], str(data["location"]), int(data["mode"]),
                        dict(zip(data["status_name"].tolist(), data["status_count"].tolist(), strict=True)), str(data["scheme"]),
@@ -169,7 +170,8 @@ def backbone_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_
     error_f, error_d = np.full(len(release.grid), np.nan), np.full(len(release.grid), np.nan)
     if ok.any():
         middle = _median_sample(frequency, damping, ok)
-        reference = _Run(model, release, "exponential", alpha, band, progress).curves(theta[middle:middle + 1], REFERENCE_FACTOR * release.fs)
+        reference = _Run(model, release, "exponential", alpha, band, progress).curves(theta[middle:middle + 1],
+                                                                                      REFERENCE_FACTOR * release.fs)
         error_f, error_d = frequency[middle] - reference[0][0], damping[middle] - reference[1][0]
     period_error, false_damping = parts[0][3], parts[0][4]
     return Bands(release.grid, quantiles(frequency, ok), quantiles(damping, ok), frequency, damping, error_f, error_d, at, mode, counts,

@@ -4,8 +4,10 @@ At each amplitude of one mode the conservative motion u(θ), θ = Ωt, is balanc
 
     (ω_k² − h²Ω² + 2iζ_k ω_k hΩ) U_kh = −F_kh,    U_mode,1 = a  ⇒  Ω² = ω² + Re F_mode,1 / a
 
-(Krack and Gross 2019, chapter 2, with the amplitude prescribed). The decay follows from the action J = ½ Ω Σ h²|U_kh|², which loses W/2π per radian where W
-is the energy taken out per cycle, so that the rate of decay of the amplitude A is (W/2π) / (J dlnJ/dlnA) (averaging; Krylov and Bogoliubov).
+(Krack and Gross 2019, chapter 2, with the amplitude prescribed). The decay follows from the action J = ½ Ω Σ h²|U_kh|², which loses W/2π
+per radian where W
+is the energy taken out per cycle, so that the rate of decay of the amplitude A is (W/2π) / (J dlnJ/dlnA) (averaging; Krylov and
+Bogoliubov).
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ INTERACTION = 0.02
 CHUNK_BYTES = 2**25
 
 
-def fast_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_amplitude: float, mode: int = 0, amplitudes: ArrayLike | None = None,
+def fast_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_amplitude: float, mode: int = 0,
+               amplitudes: ArrayLike | None = None,
                stop_amplitude: float | None = None, samples: int = 200, seed: int = 0) -> Bands:
     """Backbone bands of one mode by harmonic balance and averaging, far faster than time integration.
 
@@ -43,13 +46,15 @@ def fast_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_ampl
     Returns
     -------
     Bands
-        ``scheme`` is ``"averaging"``; the numerical errors are NaN, as nothing is integrated. Status of a sample: ``"ok"``; ``"modes interact"``: more than
+        ``scheme`` is ``"averaging"``; the numerical errors are NaN, as nothing is integrated. Status of a sample: ``"ok"``; ``"modes
+        interact"``: more than
         2 % of the kinetic energy is in other modes or harmonics somewhere, so a decay would beat; ``"not converged"``.
 
     Raises
     ------
     ValueError
-        If the location does not move in this mode, or a term is neither odd and memoryless nor of Masing's kind: those need time integration.
+        If the location does not move in this mode, or a term is neither odd and memoryless nor of Masing's kind: those need time
+        integration.
     """
     theta = np.atleast_2d(draws.draws(samples, seed) if isinstance(draws, Drawable) else np.asarray(draws, dtype=float))
     shape = abs(float(model.linear.rows((at,))[0, mode]))
@@ -67,7 +72,8 @@ def fast_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_ampl
     nothing = np.full(len(grid), np.nan)
     counts = {str(name): int((status == name).sum()) for name in np.unique(status)}
     zero = np.zeros(model.linear.modes)
-    return Bands(grid, quantiles(frequency, ok), quantiles(damping, ok), frequency, damping, nothing, nothing.copy(), at, mode, counts, "averaging",
+    return Bands(grid, quantiles(frequency, ok), quantiles(damping, ok), frequency, damping, nothing, nothing.copy(), at, mode, counts,
+                 "averaging",
                  0.0, zero, zero.copy())
 
 
@@ -126,8 +132,8 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     other = 1 - np.abs(motion[mode, ..., 0]) ** 2 / kinetic.sum(axis=0)
     used = (log_a >= wanted[0] - 0.1) & (log_a <= wanted[-1] + 0.1)
     status = np.full(len(theta), "ok", dtype="<U16")
-    status[(np.nan_to_num(other, nan=1.0) > INTERACTION)[:, used].any(axis=1)] = "modes interact"
     status[~(converged & np.isfinite(w) & (peak > 0))[:, used].all(axis=1)] = "not converged"
+    status[(np.nan_to_num(other, nan=1.0) > INTERACTION)[:, used].any(axis=1)] = "modes interact"
     out = np.full((2, len(theta), len(wanted)), np.nan)
     good = status == "ok"
     if good.any():
@@ -145,7 +151,8 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     return out[0], out[1], status
 
 
-def _balance(model: Model, theta: Array, omega: Array, zeta: Array, mode: int, amplitude: Array) -> tuple[Complex, Array, NDArray[np.bool_], Complex]:
+def _balance(model: Model, theta: Array, omega: Array, zeta: Array, mode: int, amplitude: Array) -> tuple[Complex, Array,
+                                                                                                          NDArray[np.bool_], Complex]:
     """Harmonics U (m, S, K, h), Ω² (S, K), convergence (S, K) and modal forces F (m, S, K, h)."""
     joints = _Joints(model, theta)
     nodes, weights = np.polynomial.legendre.leggauss(POINTS)

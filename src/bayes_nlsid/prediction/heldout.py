@@ -86,7 +86,8 @@ class Heldout:
 
 
 def heldout(model: Model, draws: ArrayLike | Drawable, recording: Recording, *, band: tuple[float, float] | None = None,
-            noise: NoiseFloor | None = None, start: Start | None = None, samples: int = 100, seed: int = 0, scheme: SchemeName = "exponential",
+            noise: NoiseFloor | None = None, start: Start | None = None, samples: int = 100, seed: int = 0,
+            scheme: SchemeName = "exponential",
             tolerance: float | None = None, compiled: bool | None = None, progress: Callable[[str], None] | None = None) -> Heldout:
     """Predict a recording by forward simulation.
 
@@ -100,8 +101,10 @@ def heldout(model: Model, draws: ArrayLike | Drawable, recording: Recording, *, 
     noise : NoiseFloor or None
         Of the sensors; by default from the recording itself.
     start : {"rest", "estimate"} or None
-        Where motion begins. None: estimated for free decays and for transients that are under way at the first sample, rest otherwise. The estimate is
-        a least-squares fit of the modal state to the first cycles, for every draw, with what noise leaves open of it. Periodic recordings are predicted in steady state.
+        Where motion begins. None: estimated for free decays and for transients that are under way at the first sample, rest otherwise.
+        The estimate is
+        a least-squares fit of the modal state to the first cycles, for every draw, with what noise leaves open of it. Periodic
+        recordings are predicted in steady state.
     samples, seed : int
         How many draws of a posterior; seed of these draws and of the draws of an estimated start.
     tolerance : float or None

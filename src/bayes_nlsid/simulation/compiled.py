@@ -1,6 +1,7 @@
 """Compiled forces of all elements for samples side by side in lanes; the loop over them stands in ``compiled_loop.py``.
 
-Import this module only where compiled code is about to run: it imports numba. Arrays end in the lane axis; what each means stands in ``lanes.py``.
+Import this module only where compiled code is about to run: it imports numba. Arrays end in the lane axis; what each means stands in
+``lanes.py``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The time loop compiled: the same scheme as ``stepping.py`` step by step, for samples side by side in lanes.
 
-Import this module only where compiled code is about to run: it brings numba with it. Arrays end in the lane axis; ``W`` is the number of lanes, or 1
+Import this module only where compiled code is about to run: it brings numba with it. Arrays end in the lane axis; ``W`` is the number of
+lanes, or 1
 where all lanes share the linear part. What each array means stands in ``lanes.py``, which builds them.
 """
 
@@ -329,7 +330,8 @@ def _store(lin: Linear, mot: Motion, rows: np.ndarray, k: int, outs: tuple[Any, 
 
 
 @kernel
-def advance(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarray, first: int, last: int, force: np.ndarray, rows: np.ndarray,
+def advance(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarray, first: int, last: int, force: np.ndarray,
+            rows: np.ndarray,
             every: int, outs: tuple[Any, ...]) -> int:
     """Steps ``first`` to ``last`` of a call; returns where it stopped, before ``last`` only if a stack of reversals needs more room.
 

@@ -80,7 +80,8 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     stop_amplitude : float or None
         Stop once the largest displacement (m) at ``keep[0]`` over at least one period of the first mode is below this in every sample.
     compiled : bool or None
-        None: the compiled loop for long runs, numpy for short ones, for which compiling would take longer than running; True or False: as told. Both
+        None: the compiled loop for long runs, numpy for short ones, for which compiling would take longer than running; True or False:
+        as told. Both
         give the same numbers up to rounding. Laws of a user's own and laws that jump run in numpy always.
     progress : callable or None
         Told in a sentence before the first compilation.
@@ -105,11 +106,13 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     first = coefficients if same else steps(omega[0], zeta[0], 1 / fs, scheme, alpha)
     period_error, false_damping = spectrum(first, omega[0], zeta[0])
     wanted = compiled if compiled is not None else samples * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
-    stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None, wanted)
+    stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None,
+                            wanted)
     window = int(np.ceil(fs / (omega.min() / (2 * np.pi)) / every)) * every
     stored, status = _drive(request, stepper, window, stop_amplitude, skip)
     final = tuple(np.ascontiguousarray(a.T) for a in (stepper.displacement, stepper.velocity))
-    return Response(every / fs, request.keep, stored[0], stored[1], stored[2], status=status, iterations=stepper.iterations.copy(), unconverged=stepper.failures.copy(),
+    return Response(every / fs, request.keep, stored[0], stored[1], stored[2], status=status, iterations=stepper.iterations.copy(),
+                    unconverged=stepper.failures.copy(),
                     scheme=scheme, period_error=period_error, false_damping=false_damping, final_displacement=final[0],
                     final_velocity=final[1], compiled=ran)
 
@@ -200,7 +203,8 @@ def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: flo
     """Run block by block: store, watch for divergence, stop at the floor. Returns the three quantities (S, n, L) and the status (S,)."""
     rows, every = request.rows, request.every
     count, locations = request.theta.shape[0], len(request.keep)
-    per_step = 8 * max(1, count) * max(1, request.model.linear.modes if request.force is not None and request.force.ndim == 3 else locations)
+    per_step = 8 * max(1, count) * max(1,
+                                       request.model.linear.modes if request.force is not None and request.force.ndim == 3 else locations)
     block = max(every, min(4096, BLOCK_BYTES // per_step) // every * every)
     if stop_amplitude is not None:
         block = max(block, window)

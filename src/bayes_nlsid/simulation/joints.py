@@ -75,7 +75,8 @@ class Joints:
 
     Notes
     -----
-    A law that jumps by ±J at zero (dry friction) is read as a set: its force is the λ that solves λ = clip(λ + ρ v, −J, J), whatever ρ > 0. That
+    A law that jumps by ±J at zero (dry friction) is read as a set: its force is the λ that solves λ = clip(λ + ρ v, −J, J), whatever ρ >
+    0. That
     is the implicit treatment of sticking: where the clip is inactive the equation left is v = 0 (Alart and Curnier 1991).
     """
 
@@ -134,13 +135,15 @@ class Joints:
         for group in self.static:
             for name in group.jumps:
                 still = (q if name == "q" else v)[group.rows] == 0
-                force[group.rows] += np.where(still, self._height(group, name, q[group.rows], v[group.rows]) * np.sign(acceleration[group.rows]), 0.0)
+                force[group.rows] += np.where(still, self._height(group, name, q[group.rows],
+                                                                  v[group.rows]) * np.sign(acceleration[group.rows]), 0.0)
         return force
 
     def evaluate(self, q: Array, v: Array | None, g: Array | None) -> tuple[Array, Array, Array | None, Array | None]:
         """Force (R, S), its slopes by q and by v, and where friction holds, from the committed history.
 
-        ``g`` (R, S): the force that belongs to q, v. Where friction holds (last array true), force − g is ρ times the motion that must vanish, and
+        ``g`` (R, S): the force that belongs to q, v. Where friction holds (last array true), force − g is ρ times the motion that must
+        vanish, and
         the slopes are its slopes. The slope by v is None while no law depends on velocity, the last array while no law jumps.
         """
         w = self._still if v is None else v

@@ -45,7 +45,8 @@ class Linear(NamedTuple):
 
 @final
 class Elements(NamedTuple):
-    """Entries (one law at one location): kind, code, power, row, fast (E,); p (E, lanes, 6); coefficient (E, 5, lanes); spring (E, lanes)."""
+    """Entries (one law at one location): kind, code, power, row, fast (E,); p (E, lanes, 6); coefficient (E, 5, lanes); spring (E,
+    lanes)."""
 
     kind: NDArray[np.int64]
     code: NDArray[np.int64]
@@ -59,7 +60,8 @@ class Elements(NamedTuple):
 
 @final
 class Memory(NamedTuple):
-    """Histories: last (4, E, lanes), depth (E, lanes), ends and forces (E, lanes, room); the branch each Masing entry is on: origin, base, half,
+    """Histories: last (4, E, lanes), depth (E, lanes), ends and forces (E, lanes, room); the branch each Masing entry is on: origin,
+    base, half,
     far (E, lanes); sliders of entry ``slot[e]``: theta (s, lanes), stiffness, slip, stretch, sliding (s, lanes, sliders)."""
 
     present: bool
@@ -176,7 +178,8 @@ def _elements(joints: Joints, codes: list[tuple[int, float]], which: NDArray[np.
                 inverse = np.minimum(k_t * (b + m / (m + 1)) / np.maximum(f_s * (1 + b), 1e-300), 1e290)
             coefficient[e] = k_t, (1 - theta * m / (m + 1)) / (1 + b), m, inverse, theta * f_s
     return Elements(np.array([KINDS[x.term.memory] for x in entries], dtype=np.int64), np.array([c[0] for c in codes], dtype=np.int64),
-                    np.array([c[1] for c in codes], dtype=float), np.array([x.row for x in entries], dtype=np.int64), fast, p, coefficient, spring)
+                    np.array([c[1] for c in codes], dtype=float), np.array([x.row for x in entries], dtype=np.int64), fast, p,
+                    coefficient, spring)
 
 
 def _memory(joints: Joints, dt: float, which: NDArray[np.intp]) -> Memory:
@@ -190,7 +193,8 @@ def _memory(joints: Joints, dt: float, which: NDArray[np.intp]) -> Memory:
     slip = np.stack([x[1] for x in made]) if made else np.zeros((0, lanes, 0))
     theta = np.stack([np.broadcast_to(x[2][:, 0], (lanes,)) for x in made]) if made else np.zeros((0, lanes))
     return Memory(bool(joints.memory), dt, np.zeros((4, *shape)), np.zeros(shape, dtype=np.int64), np.zeros(1, dtype=np.int64),
-                  np.zeros((*shape, ROOM)), np.zeros((*shape, ROOM)), np.zeros(shape), np.zeros(shape), np.ones(shape), np.zeros(shape), slot,
+                  np.zeros((*shape, ROOM)), np.zeros((*shape, ROOM)), np.zeros(shape), np.zeros(shape), np.ones(shape), np.zeros(shape),
+                  slot,
                   theta, stiffness, slip, np.zeros_like(slip), np.zeros_like(slip))
 
 
@@ -201,8 +205,10 @@ def _motion(c: int, m: int, r: int, lanes: int) -> Motion:
     def whole() -> NDArray[np.int64]:
         return np.zeros(lanes, dtype=np.int64)
 
-    return Motion(np.zeros((c, m, lanes)), np.zeros((m, lanes)), joint(), joint(), joint(), joint(), joint(), joint(), joint(), np.zeros(lanes),
-                  np.zeros(lanes), np.zeros(lanes), whole(), whole(), np.zeros(1, dtype=np.int64), np.zeros((c, m, lanes)), np.zeros((m, lanes)),
+    return Motion(np.zeros((c, m, lanes)), np.zeros((m, lanes)), joint(), joint(), joint(), joint(), joint(), joint(), joint(),
+                  np.zeros(lanes),
+                  np.zeros(lanes), np.zeros(lanes), whole(), whole(), np.zeros(1, dtype=np.int64), np.zeros((c, m, lanes)), np.zeros((m,
+                                                                                                                                      lanes)),
                   np.zeros((m, lanes)), np.zeros((5, lanes)))
 
 
@@ -259,7 +265,8 @@ class CompiledStepper:
     @property
     def acceleration(self) -> Array:
         """Modal accelerations (m, S) from the equation of motion."""
-        return self._gathered(lambda block: block.motion.f - block.linear.damping * block.motion.x[1] - block.linear.stiffness * block.motion.x[0])
+        return self._gathered(lambda block: (block.motion.f - block.linear.damping * block.motion.x[1]
+                                             - block.linear.stiffness * block.motion.x[0]))
 
     def advance(self, count: int, force: Array | None, rows: Array, every: int, out: tuple[Array | None, ...]) -> None:
         """As ``NumpyStepper.advance``."""

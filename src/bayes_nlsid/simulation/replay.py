@@ -76,7 +76,8 @@ def predict_record(model: Model, theta: ArrayLike, recording: Recording, *, u0: 
     model : Model
     theta : array_like (S, P)
     recording : Recording
-        Its force drives the model: repeated until steady if the recording is periodic, else once. Between samples it is interpolated, periodic forces
+        Its force drives the model: repeated until steady if the recording is periodic, else once. Between samples it is interpolated,
+        periodic forces
         exactly (Fourier), others by cubic splines.
     u0, v0 : array_like (m,) or (S, m) or None
         Modal state at the first sample; rest if None. Free decays need it. Periodic recordings start from the linear steady state.
@@ -149,7 +150,8 @@ class _Source:
         recording = self.recording
         kept = recording.n if count is None else count
         quantities = tuple(dict.fromkeys(c.quantity for c in recording.channels))
-        response = simulate(self.model, theta, fs=recording.fs * substeps, samples=(skip + kept - 1) * substeps + 1, force=force, u0=start[0],
+        response = simulate(self.model, theta, fs=recording.fs * substeps, samples=(skip + kept - 1) * substeps + 1, force=force,
+                            u0=start[0],
                             v0=start[1], scheme=self.scheme, keep=self.locations, every=substeps, store=quantities, skip=skip * substeps,
                             compiled=self.compiled, progress=self.progress)
         full = np.full((len(theta), kept, len(recording.channels)), np.nan)
@@ -194,7 +196,8 @@ def _steady(source: _Source, theta: Array, substeps: int) -> tuple[Array, NDArra
     omega, zeta = source.model.linear_values(theta)
     memory = period * recording.dt * np.maximum((omega * zeta).min(axis=-1), 1e-12)
     start = _linear_steady(source, theta)
-    # the linear steady state is close, so a start error of order one need only fall to the tolerance; at least two periods for the comparison
+    # the linear steady state is close, so a start error of order one need only fall to the tolerance; at least two periods for the
+    # comparison
     settle = int(np.clip(np.ceil(np.log(1 / SETTLED) / memory.min()), 2, MOST_PERIODS))
     count = 2 * period
     total = settle * period + count
@@ -239,7 +242,8 @@ def _finer_periodic(x: Array, factor: int) -> Array:
 def _finer(x: Array, factor: int) -> Array:
     """A transient on a grid ``factor`` times finer, by cubic splines."""
     if factor == 1 or len(x) < 4:
-        return x if factor == 1 else np.stack([np.interp(np.arange((len(x) - 1) * factor + 1) / factor, np.arange(len(x)), c) for c in x.T], axis=1)
+        return x if factor == 1 else np.stack([np.interp(np.arange((len(x) - 1) * factor + 1) / factor, np.arange(len(x)),
+                                                         c) for c in x.T], axis=1)
     from scipy.interpolate import CubicSpline
 
     return np.asarray(CubicSpline(np.arange(len(x)), x, axis=0)(np.arange((len(x) - 1) * factor + 1) / factor), dtype=float)

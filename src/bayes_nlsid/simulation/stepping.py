@@ -1,7 +1,8 @@
 """The time loop in numpy: all samples at once, Newton on the joints only.
 
 With f = p − Bᵀg (g: force at the R locations that carry elements), a step gives q(n+1) = q⁰ − S_q g and v(n+1) = v⁰ − S_v g with constant
-S_q = B diag(b_u) Bᵀ and S_v = B diag(b_v) Bᵀ: however many modes there are, only g is unknown. One evaluation at the extrapolated g with a first-order
+S_q = B diag(b_u) Bᵀ and S_v = B diag(b_v) Bᵀ: however many modes there are, only g is unknown. One evaluation at the extrapolated g with
+a first-order
 correction is accepted where the residual says so; all other samples go through Newton with line search.
 """
 
@@ -227,7 +228,8 @@ class NumpyStepper:
         return new, (f, fq, fv, held), doubt.any(axis=0)
 
     def _newton(self, q0: Array, v0: Array | None, g: Array, accepted: Array, at: Evaluated, active: NDArray[np.bool_]) -> Array:
-        """Converged Newton with line search on e(g) = f(q⁰ − S_q g, v⁰ − S_v g) − g for the active samples; the others keep ``accepted``."""
+        """Converged Newton with line search on e(g) = f(q⁰ − S_q g, v⁰ − S_v g) − g for the active samples; the others keep
+        ``accepted``."""
         lin = self.linear
         f, fq, fv, held = at
         g = np.where(active, g, accepted)
