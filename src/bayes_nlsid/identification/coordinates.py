@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -35,7 +36,7 @@ class Coordinates:
         if self.scale.ndim != 1 or not np.isfinite(self.scale).all() or (self.scale < 0).any():
             raise ValueError(f"scale must be (P,), finite and not negative (0 means logarithmic), got {self.scale}")
 
-    @property
+    @cached_property
     def logarithmic(self) -> NDArray[np.bool_]:
         """(P,) which entries are log10."""
         return self.scale == 0
@@ -44,20 +45,28 @@ class Coordinates:
         """Search coordinates (..., P) of theta (..., P); −inf or NaN where a positive entry is not positive."""
         values = np.asarray(theta, dtype=float)
         positive = self.logarithmic
+        out = np.empty(values.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
-            log = np.log10(np.where(positive, values, 1.0))
-        return np.where(positive, log, symlog.forward(values, np.where(positive, 1.0, self.scale)))
+            out[..., positive] = np.log10(values[..., positive])
+        if not positive.all():
+            out[..., ~positive] = symlog.forward(values[..., ~positive], self.scale[~positive])
+        return out
 
     def to_theta(self, s: ArrayLike) -> NDArray[np.float64]:
         """Theta (..., P) of search coordinates (..., P)."""
         values = np.asarray(s, dtype=float)
         positive = self.logarithmic
-        power = 10.0 ** np.where(positive, values, 0.0)
-        return np.where(positive, power, symlog.inverse(np.where(positive, 0.0, values), np.where(positive, 1.0, self.scale)))
+        out = np.empty(values.shape)
+        out[..., positive] = 10.0 ** values[..., positive]
+        if not positive.all():
+            out[..., ~positive] = symlog.inverse(values[..., ~positive], self.scale[~positive])
+        return out
 
     def log_jacobian(self, s: ArrayLike) -> NDArray[np.float64]:
         """log |dtheta/ds|, (..., P)."""
         values = np.asarray(s, dtype=float)
         positive = self.logarithmic
-        signed = symlog.log_jacobian(np.where(positive, 0.0, values), np.where(positive, 1.0, self.scale))
-        return np.where(positive, np.log(LN10) + LN10 * values, signed)
+        out = np.log(LN10) + LN10 * values
+        if not positive.all():
+            out[..., ~positive] = symlog.log_jacobian(values[..., ~positive], self.scale[~positive])
+        return out
