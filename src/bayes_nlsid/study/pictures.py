@@ -160,8 +160,8 @@ def _backbone(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     published = [{"label": p.label, "frequency": p.frequency, "damping": p.damping} for p in study.report.published]
     image = png(backbone_bands, arrays, measured, location=data["at"], alternatives=rivals, published=published,
                 numerical=arrays.get("numerical_error_frequency"))
-    caption = (f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND} Circles are measured directly "
-               "from the recording by zero crossings and were not fitted.")
+    circles = " Circles are measured directly from the recording by zero crossings and were not fitted." if measured is not None else ""
+    caption = f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND}{circles}"
     return [Picture("backbone", "prediction", caption, "stages/predict, backbone.npz", image)]
 
 

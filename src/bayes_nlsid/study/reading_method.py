@@ -117,7 +117,8 @@ def read_identification(table: Table | None, locations: Sequence[str], terms: Se
         alternatives, tied, excess, widening, table.number("eps1", default=None, positive=True),
         table.number("eps2", default=None, positive=True), table.integer("starts", 50, low=1),
         table.number("rate", "frequency", None, positive=True), _spans(table, "mode_bands", len(modes)),
-        table.flag("static_correction", False), table.number("settle", "time", 0.0), table.flag("output_error", False))
+        table.flag("static_correction", False), table.number("settle", "time", 0.0), table.integer("most", 6, low=1),
+        table.flag("output_error", False))
     table.close()
     return entry
 

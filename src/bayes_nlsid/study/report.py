@@ -53,7 +53,9 @@ def render(report: Report) -> str:
     told = "".join(html.paragraph(sentence) for sentence in story(report.study, report.result))
     body = [f'<p class="soft">bayes_nlsid {escape(str(report.result["versions"].get("bayes_nlsid", "")))}, seed '
             f'{report.result["seed"]}</p>',
-            f"<h1>{escape(report.study.title)}</h1>", f"<p>{badge}</p>", f'<div class="story">{told}</div>', f"<nav>{links}</nav>"]
+            f"<h1>{escape(report.study.title)}</h1>", f"<p>{badge}</p>", f'<div class="story">{told}</div>',
+            '<p class="soft">Every number above stands in result.json; tables and figures below name the stage they come from.</p>',
+            f"<nav>{links}</nav>"]
     body += [f'<section id="{name}"><h2>{escape(title)}</h2>{content}</section>' for name, title, content in parts]
     return html.page(report.study.title, "\n".join(body))
 

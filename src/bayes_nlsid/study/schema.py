@@ -85,7 +85,7 @@ class IdentificationEntry:
 
     ``modes``, ``main`` and ``free_modes`` are 1-based. ``candidates`` are names of terms with groups already spelled out; empty means
     that the form is known (``elements``). ``band`` (Hz) bounds the residual, ``rate`` (Hz) lowers the sampling, ``mode_bands`` gives
-    each mode a filter of its own. ``settle`` (s) is the start of every
+    each mode a filter of its own. ``most`` is the largest number of terms that a selection may keep. ``settle`` (s) is the start of every
     training record that enters the memory of the joints but not the residual. ``output_error`` refines the regression by least squares
     on the simulated response.
     """
@@ -109,6 +109,7 @@ class IdentificationEntry:
     mode_bands: tuple[tuple[float, float], ...] = ()
     static_correction: bool = False
     settle: float = 0.0
+    most: int = 6
     output_error: bool = False
 
 

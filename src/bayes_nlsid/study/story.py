@@ -31,9 +31,10 @@ def _found(result: Mapping[str, Any]) -> str:
                 "recordings can tell.")
     terms = " and ".join(f"{t['name']} at {', '.join(t['locations'])}" for t in chosen["terms"])
     share = 100 * (1 - score["mse"] / score["mse_linear"]) if score["mse_linear"] else 0.0
-    way = "was chosen from the library" if chosen["forward"] else "was given as the form"
+    verb = "was" if len(chosen["terms"]) == 1 else "were"
+    way = f"{verb} chosen from the library" if chosen["forward"] else f"{verb} given as the form"
     left = f"; what is left is {score['mse'] / score['floor']:.3g} times what sensor noise alone would leave" if score.get("floor") else ""
-    return f"{terms} {way}; it removes {share:.1f} % of what the linear model leaves unexplained{left}."
+    return f"{terms} {way}, removing {share:.1f} % of what the linear model leaves unexplained{left}."
 
 
 def _against_alternatives(result: Mapping[str, Any]) -> str:
