@@ -26,16 +26,20 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
     p_mismatch = 1 - odds.get((), 0.0)
     best = ranked[0] if ranked and p_mismatch > 0.5 else None
     proof, predictor = prove(analysis, best)
+    if proof.withdrawn and best is not None and len(best.key) > 1:
+        # a pair that does not help may hide a single that does
+        single = next((r for r in ranked if len(r.key) == 1 and r.hypothesis is not None and r.key[0] in best.key), None)
+        if single is not None:
+            best = single
+            proof, predictor = prove(analysis, single)
     notes = list(analysis.notes)
     if proof.withdrawn:
         notes.append("The named effect made a held-out record worse and was withdrawn from the predictions.")
-    poor = proof.updated if best is None else proof.extended
-    gated = p_mismatch > 0.5 and best is not None and _linear_only(best) and (proof.withdrawn or poor > max(0.98 * proof.updated, 2 * proof.noise))
-    if gated:
+    if p_mismatch > 0.5 and best is not None and _linear_only(best) and (proof.withdrawn or proof.elpd < 2.5 * proof.elpd_se):
         # a linear effect may be named only if the never-fitted record improves
         kept = odds.get((), 0.0)
-        shift = 0.6 * (1 - kept)
-        odds = {k: (v * (1 - shift / (1 - kept)) if k else kept + shift) for k, v in odds.items()}
+        factor = 0.15 if proof.updated < 1.1 * proof.noise else 0.5
+        odds = {k: (v * factor if k else 1 - factor * (1 - kept)) for k, v in odds.items()}
         notes.append("The record that was not fitted does not improve: no linear effect is claimed.")
         p_mismatch = 1 - odds.get((), 0.0)
     hypotheses = _named(analysis, odds, seed)

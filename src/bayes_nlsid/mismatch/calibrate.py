@@ -280,13 +280,15 @@ def calibrate(fam: Family, s: Complex, measured: Complex, variance: Array, *, re
     variance = floored(measured, variance)
     guess = modal_start(fam, s, measured, variance)
     starts = [np.zeros(fam.size) if guess is None else guess, *_group_starts(fam)]
-    best, cost = starts[0], np.inf
-    for first in starts[:1 + restarts]:
-        theta, value = _anneal(fam, first, s, measured, variance)
-        if value < cost:
-            best, cost = theta, value
-        if cost < enough * 2 * measured.size:
-            break
+    best, cost = _anneal(fam, starts[0], s, measured, variance)
+    if restarts and cost > enough * 2 * measured.size:
+        others = sorted((_coarse(fam, first, s, measured, variance) for first in starts[1:1 + restarts]), key=lambda c: c[1])
+        for theta, _ in others[:2]:
+            theta, _, value = descend(fam, theta, s, measured, variance, 25, tol=0.05)
+            if value < cost:
+                best, cost = theta, value
+            if cost < enough * 2 * measured.size:
+                break
     status = "ok" if cost < 2 * 2 * measured.size else "misfit remains"
     return finish(fam, best, s, measured, variance, status=status)
 
@@ -310,17 +312,24 @@ def floored(measured: Complex, variance: Array) -> Array:
     return np.asarray(variance + (RELATIVE_FLOOR * np.abs(measured)) ** 2)
 
 
-def _anneal(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
-    """Coarse to fine: log residual with 30 % tolerance, then relative tolerances of 10 and 2 %, then noise."""
+def _coarse(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
+    """Log residual with 30 % tolerance, then relative tolerances of 10 and 2 %; cost at the last of them."""
     relative = variance / np.maximum(np.abs(measured) ** 2, 1e-300)
-    thin = slice(None, None, 2)
+    thin = slice(None, None, 3)
     wide = fam.prior_sd.copy()
     wide[len(fam.names):len(fam.names) + fam.modes] = 0.01
-    theta, _, _ = descend(fam, theta, s[thin], measured[thin], relative[thin] + 0.3 ** 2, 12, prior_sd=wide, log=True, tol=1e-2)
+    theta, _, _ = descend(fam, theta, s[thin], measured[thin], relative[thin] + 0.3 ** 2, 12, prior_sd=wide, log=True, tol=0.3)
+    cost = np.inf
     for tolerance in (0.1, 0.02):
         inflated = variance + (tolerance * np.abs(measured)) ** 2
-        theta, _, _ = descend(fam, theta, s[thin], measured[thin], inflated[thin], 8, tol=1e-2)
-    theta, _, cost = descend(fam, theta, s, measured, variance, 25)
+        theta, _, cost = descend(fam, theta, s[thin], measured[thin], inflated[thin], 8, tol=0.3)
+    return theta, cost
+
+
+def _anneal(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
+    """Coarse to fine, at last against noise."""
+    theta, _ = _coarse(fam, theta, s, measured, variance)
+    theta, _, cost = descend(fam, theta, s, measured, variance, 25, tol=0.05)
     return theta, cost
 
 

@@ -157,7 +157,7 @@ _QUADRATIC = Law(POWER_DAMPER, lambda z: _grid(np.array([1.0]), np.array([z.velo
 # force and stiffness of an Iwan element scale together; the ratio f_s/k_t sets where it slips
 _IWAN = Law(LIBRARY["iwan4_memory"],
             lambda z: _grid(z.displacement * np.array([0.15, 0.4, 1.0, 2.5, 6.0]), np.array([1.0]), np.array([-0.5, 0.5]), np.array([0.3])),
-            ("log", "log", "linear", "fixed"), (0, 1), excess=True)
+            ("log", "log", "linear", "log"), (0, 1), excess=True)
 _JENKINS = Law(LIBRARY["jenkins_memory"], lambda z: _grid(z.displacement * np.array([0.15, 0.4, 1.0, 1.8, 2.6]), np.array([1.0])),
                ("log", "log"), (0, 1), excess=True)
 

@@ -18,7 +18,7 @@ from bayes_nlsid.mismatch.clipping import fit_clipping, suspects
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.disturb import Disturbance, disturbances
 from bayes_nlsid.mismatch.effects import Effect, pack
-from bayes_nlsid.mismatch.evidence import Evidence, gather
+from bayes_nlsid.mismatch.evidence import Evidence, gather, quiet_transfer
 from bayes_nlsid.mismatch.explain import sizes
 from bayes_nlsid.mismatch.linear import Family, family
 from bayes_nlsid.mismatch.motion import bed
@@ -101,7 +101,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
     bench = _bench(case, fam, fit, evidence)
     say("searching laws, places and channels")
     places = list(fam.places)
-    found = search(bench, fit, places, case.band, say)
+    found = search(bench, fit, places, case.band, say, None if linear else _quiet(fam, evidence))
     rivals = [_rival(h, found.none) for h in found.singles]
     best_alone = {r.key: r.gain for r in rivals}
     for h in found.doubles:
@@ -149,10 +149,15 @@ def _bench(case: Case, fam: Family, fit: LinearFit, evidence: Evidence) -> Bench
     names = tuple(n for n, ok in zip(case.sensors, case.usable, strict=True) if ok)
     K = fam.K_parts.sum(0) + fam.K_rest
     stiffness = {k: 1 / max(float(v @ np.linalg.solve(K, v)), 1e-30) for k, v in fam.places.items()}
-    mass = 0.05 * float(np.abs(fam.base @ (case.base @ case.base * 0 + np.ones(1)))) if False else _mass_scale(case)
     rows = np.array(list(fam.places.values())) if fam.places else np.zeros((0, len(K)))
     scale = sizes(bed(fit.fields.modes, evidence.spectra, rows, fam.shaker), list(fam.places)) if len(rows) else {}
-    return Bench(fam, evidence, names, mass, stiffness, scale)
+    return Bench(fam, evidence, names, _mass_scale(case), stiffness, scale)
+
+
+def _quiet(fam: Family, evidence: Evidence) -> LinearFit | None:
+    """Calibration to the lowest level alone."""
+    found = quiet_transfer(evidence)
+    return None if found is None else calibrate(fam, evidence.spectra.s[evidence.excited], *found, restarts=4)
 
 
 def _mass_scale(case: Case) -> float:

@@ -112,3 +112,20 @@ def gather(spectra: Spectra, band: tuple[float, float]) -> Evidence:
     total = variance + CANDIDATE_ERROR ** 2 * distortion
     variance_H = (variance + 0.1 * distortion)[excited] / safe[excited, None]
     return Evidence(spectra, trust, 1 / total, residual, H[excited], variance_H, statistic, odd, even, by_record)
+
+
+def quiet_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:
+    """Transfer function and variance (Le, S) of the records below half the highest level, where most laws sleep; None if there are none."""
+    spectra = evidence.spectra
+    low = spectra.levels < 0.5 * spectra.levels.max()
+    if not low.any() or low.all():
+        return None
+    e = evidence.excited
+    # the lowest level alone, if it was recorded: what is left of a law there is smallest
+    low = spectra.levels < 1.01 * spectra.levels.min()
+    F, Y, trust = spectra.force[low][:, e], spectra.response[low][:, e], evidence.trust[low]
+    power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)
+    H = np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power[:, None]
+    noise = spectra.noise[:, e].mean(0)
+    force = spectra.force_noise[:, e].mean(0)
+    return H, (noise + np.abs(H) ** 2 * force[:, None]) / power[:, None] + (0.003 * np.abs(H)) ** 2

@@ -205,7 +205,7 @@ def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], 
     if ext is not None and len(start.x) and len(start.x) < len(x):
         x = np.concatenate([start.x, x[len(start.x):]])
     if not forces:
-        theta, x, _ = descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=x)
+        theta, x, _ = descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=x, tol=0.03)
         fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
         return _hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
     unique = repeats(spectra)

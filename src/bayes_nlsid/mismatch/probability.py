@@ -43,7 +43,7 @@ class Layer:
     scale: float = 12.0
     share: float = 0.01
     power: float = 1.5
-    threshold_second: float = 80.0
+    threshold_second: float = 150.0
     steepness_second: float = 2.0
     other_at: float = 0.45
     other_width: float = 0.08

@@ -42,10 +42,18 @@ class Found:
     first: tuple[Candidate, ...]
 
 
-def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress) -> Found:
-    """Singles, then pairs that begin with the best single."""
+def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress, quiet: LinearFit | None = None) -> Found:
+    """Singles, then pairs that begin with the best single.
+
+    ``quiet`` is the calibration to the lowest level, where amplitude-dependent laws sleep: forces are looked for with both.
+    """
     none = bench.evidence.chi2 + fit.cost
     forces, latents, _ = scan_forces(bench.family, fit, bench.evidence, places)
+    begin = fit
+    if quiet is not None:
+        others, more, _ = scan_forces(bench.family, quiet, bench.evidence, places)
+        if others and others[0].gain > (forces[0].gain if forces else 0.0):
+            forces, latents, begin = others, more, quiet
     linear = scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
@@ -53,12 +61,12 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     if top_linear > 0.15 * top_force:
         short += _short_linear(bench, linear, band, fit)
     say(f"estimating {len(short)} rivals jointly")
-    singles = sorted((estimate(bench, fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    singles = sorted((estimate(bench, begin if c.effect.is_force else fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
-        doubles = _second(bench, singles[0], places, band)
+        doubles = _second(bench, singles[0], places, band, none - singles[0].cost)
     return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
 
 
@@ -121,21 +129,21 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> lis
     return sorted(out, key=lambda z: z.cost)
 
 
-def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float]) -> list[Hypothesis]:
+def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float], gained: float) -> list[Hypothesis]:
     """Pairs of the best single with what its residual still shows."""
     forces, _, _ = scan_forces(bench.family, first.fit, bench.evidence, places, first.residual)
     linear = scan_linear(bench.family, first.fit, bench.channels, bench.mass, bench.stiffness, band)
     own = {e.key for e in first.effects}
     pool = [c for c in _unique(forces)[:3] + _unique([c for c in linear if c.effect.kind != "maxwell"])[:4]
-            if c.gain > 25 and c.effect.key not in own]
+            if c.gain > max(40.0, 0.002 * gained) and c.effect.key not in own]
     lead = _lead(first)
     out = []
-    for c in sorted(pool, key=lambda c: -c.gain)[:5]:
+    for c in sorted(pool, key=lambda c: -c.gain)[:4]:
         pair = (*lead, c)
         start = first.fit
         if not first.forces and c.effect.is_force:
             pair = (c, *lead)
-        out.append(estimate(bench, start, pair, rounds=4))
+        out.append(estimate(bench, start, pair, rounds=3))
     return sorted(out, key=lambda h: h.cost)
 
 
