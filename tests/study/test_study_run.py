@@ -185,7 +185,8 @@ def test_report_page_stands_alone(finished: Path) -> None:
 
     Walker().feed(page.replace("<!doctype html>", ""))
     assert not opened
-    for words in ("cubic at x was chosen", "prefers-color-scheme: dark", "@media print", "SHA-256", "stages/identify", "Next:", "width=device-width"):
+    for words in ("cubic at x was chosen", "prefers-color-scheme: dark", "@media print", "SHA-256", "stages/identify", "Next:",
+                  "width=device-width"):
         assert words in page, words
 
 
