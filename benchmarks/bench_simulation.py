@@ -2,7 +2,8 @@
 
     python benchmarks/bench_simulation.py
 
-Ten modes (Table 2 of the paper), five four-parameter Iwan joints, 8192 Hz, HHT-alpha. Times are CPU time of this thread, best of some rounds.
+Ten modes (Table 2 of the paper), five four-parameter Iwan joints, 8192 Hz, HHT-alpha. Times are CPU time of this
+thread, best of some rounds.
 """
 
 from __future__ import annotations
@@ -85,15 +86,18 @@ def main() -> None:
     print(f"{'dense Newton loop':44s} {1e9 * reference:10.0f} ns per step and sample")
     cases = [("numpy, 1 sample", static, 1, 400, False), ("numpy, 100 samples", static, 100, 200, False),
              ("compiled, 1 sample", static, 1, 8000, True), ("compiled, 100 samples", static, 100, 2000, True),
-             ("compiled, 100 samples, Masing memory", memory, 100, 2000, True), ("compiled, 1 sample, Masing memory", memory, 1, 4000, True)]
+             ("compiled, 100 samples, Masing memory", memory, 100, 2000, True), ("compiled, 1 sample, Masing memory", memory, 1, 4000,
+             True)]
     for name, model, samples, count, compiled in cases:
         def run(model: Model = model, samples: int = samples, count: int = count, compiled: bool = compiled) -> object:
-            return simulate(model, theta[:samples], fs=FS, samples=count + 1, u0=u0, keep=("tip",), store=("displacement",), compiled=compiled)
+            return simulate(model, theta[:samples], fs=FS, samples=count + 1, u0=u0, keep=("tip",), store=("displacement",),
+                            compiled=compiled)
 
         each = best(run) / count / samples
         print(f"{name:44s} {1e9 * each:10.0f} ns per step and sample {reference / each:10.0f}x")
     for name, model in (("static", static), ("Masing memory", memory)):
-        seconds = best(lambda model=model: fast_bands(np.tile(theta, (10, 1)), model, at="tip", start_amplitude=3e-3), 2)  # type: ignore[misc]
+        seconds = best(lambda model=model: fast_bands(np.tile(theta, (10, 1)), model, at="tip", start_amplitude=3e-3),
+             2)  # type: ignore[misc]
         print(f"averaged backbone, 1000 samples, {name:15s} {seconds:10.2f} s")
 
 

@@ -67,7 +67,8 @@ def test_a_free_decay_is_the_simulation_from_its_start() -> None:
 def test_a_motion_that_never_settles_is_said_to_be_so() -> None:
     # lightly damped and far too short a period for the number of periods that is allowed
     model = oscillator("cubic", zeta=1e-6)
-    source = Recording("r", 1e-3, np.zeros((100, 1)), (Channel("d", "x", "displacement", "m"),), np.tile([[30.0], [-30.0]], (50, 1)) + 400.0,
+    source = Recording("r", 1e-3, np.zeros((100, 1)), (Channel("d", "x", "displacement", "m"),), np.tile([[30.0], [-30.0]], (50,
+                                                                                                                             1)) + 400.0,
                        (Channel("f", "x", "force", "N"),), period=100)
     found = predict_record(model, [[3e5]], source, substeps=1)
     assert found.status[0] == "not periodic" and found.drift[0] > 1e-3

@@ -257,15 +257,18 @@ def test_storage_can_be_thinned_and_stopped() -> None:
 
 
 def test_a_location_without_motion_is_harmless() -> None:
-    linear = ModalModel(np.array([W, 3 * W]), np.array([0.01, 0.01]), ("a", "b"), np.array([[1.0, 0.5], [0.0, 0.0]]), ("a",), (), ("a", "b"))
+    linear = ModalModel(np.array([W, 3 * W]), np.array([0.01, 0.01]), ("a", "b"), np.array([[1.0, 0.5], [0.0, 0.0]]), ("a",), (), ("a",
+                                                                                                                                   "b"))
     model = Model(linear, (Element(LIBRARY["iwan4"], ("a", "b")),))
     response = simulate(model, [[30.0, 1e3, -0.5, 0.1] * 2], fs=2000, samples=500, u0=[0.05, 0.0])
     assert response.status[0] == "ok" and np.isfinite(response.displacement).all()
 
 
 @pytest.mark.parametrize(("change", "word"), [
-    ({"theta": np.zeros((1, 3))}, "theta"), ({"theta": np.full((1, 1), np.nan)}, "theta"), ({"fs": -1.0}, "fs"), ({"samples": 1}, "samples"),
-    ({"force": np.zeros((9, 1))}, "force"), ({"u0": np.zeros(2)}, "u0"), ({"keep": ("y",)}, "unknown locations"), ({"store": ("jerk",)}, "store")])
+    ({"theta": np.zeros((1, 3))}, "theta"), ({"theta": np.full((1, 1), np.nan)}, "theta"), ({"fs": -1.0}, "fs"), ({"samples": 1},
+                                                                                                                  "samples"),
+    ({"force": np.zeros((9, 1))}, "force"), ({"u0": np.zeros(2)}, "u0"), ({"keep": ("y",)}, "unknown locations"), ({"store": ("jerk",)},
+                                                                                                                   "store")])
 def test_wrong_arguments_are_named(change: dict[str, object], word: str) -> None:
     arguments = {"theta": np.zeros((1, 1)), "fs": 100.0, "samples": 10} | change
     with pytest.raises(ValueError, match=word):
