@@ -1,0 +1,241 @@
+"""The algebra the mismatch engine stands on, against independent references."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayes_nlsid.forces.motion import force_along, motion
+from bayes_nlsid.mismatch.calibrate import calibrate, pair, vector_fit
+from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, Size, catalogue_rows
+from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
+from bayes_nlsid.mismatch.evidence import gather
+from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
+from bayes_nlsid.mismatch.motion import LawAlong, bed, gmres, settle
+from bayes_nlsid.mismatch.probability import Layer, Score, Scores, fit_layer, probabilities
+from bayes_nlsid.mismatch.prove import calibrate_bands, elpd_difference, nrmse
+from bayes_nlsid.mismatch.spectra import Spectra
+
+
+def chain_family(n: int = 8, sensors: int = 4) -> Family:
+    """A chain of masses and springs with its end springs, one inner spring and all masses as parts."""
+    K_parts, names = [], []
+    for i in (0, 3, 5):
+        b = np.zeros(n)
+        b[i] = 1
+        if i:
+            b[i - 1] = -1
+        K_parts.append(4e5 * np.outer(b, b))
+        names.append(f"J{i}_slip")
+    rest = np.zeros((n, n))
+    for i in (1, 2, 4, 6, 7):
+        b = np.zeros(n)
+        b[i], b[i - 1] = 1, -1
+        rest += 4e5 * np.outer(b, b)
+    M_parts = np.array([np.diag(np.linspace(1.0, 1.3, n))])
+    eye = np.eye(n)
+    places = {"J3_slip": eye[3] - eye[2], "J5_slip": eye[5] - eye[4]}
+    return Family((*names, "M:rho"), np.array(K_parts), M_parts, rest, np.zeros((n, n)), eye[[1, 3, 5, 7]][:sensors], eye[2], -np.ones(n),
+                  np.ones(sensors), places, {"P1": eye[1], "P4": eye[7]}, np.array([0.3, 0.3, 0.3, 0.01]), 6, 0.01,
+                  {i: np.linalg.cholesky(k + 1e-9 * np.eye(n))[:, 0] * 0 + _direction(k) for i, k in enumerate(K_parts)})
+
+
+def _direction(part: np.ndarray) -> np.ndarray:
+    j = int(np.argmax(np.diag(part)))
+    return part[j] / np.sqrt(part[j, j])
+
+
+def steady(fam: Family, theta: np.ndarray, laws: tuple = (), places: tuple[str, ...] = (), noise: float = 1e-4, records: int = 4,
+           seed: int = 0) -> Spectra:
+    """Records of a member of the family with laws at places, computed by brute-force relaxation on a fine grid."""
+    rng = np.random.default_rng(seed)
+    block, rate = 1024, 512.0
+    lines = np.arange(4, 440)
+    excited = (lines % 2 == 1) & (lines < 330)
+    modes = solve(fam, theta)
+    levels = np.array([0.3, 1.0, 1.0, 0.3])[:records]
+    half = np.zeros((records, block // 2 + 1), dtype=complex)
+    half[:, lines[excited]] = levels[:, None] * np.exp(2j * np.pi * rng.random((records, excited.sum())))
+    waves = np.fft.irfft(half * block, block, axis=1)
+    s = 2j * np.pi * lines * rate / block
+    Y = half[:, lines, None] * fields(fam, modes, s).H
+    empty = Spectra(tuple("abcd"[:records]), "steady", block, rate, 0.0, lines, excited, half[:, lines], Y, np.full(Y.shape, noise ** 2),
+                    np.full(half[:, lines].shape, 1e-20), waves, np.zeros((0, len(lines), Y.shape[2]), dtype=complex), levels,
+                    np.arange(records) * 10.0)
+    if laws:
+        rows = np.array([fam.places[p] for p in places])
+        paths = bed(modes, empty, rows, fam.shaker)
+        h = s[:, None, None] ** 2 * receptances(modes, s, fam.sensors, rows)
+        for r in range(records):
+            _, G, status = settle(paths, r, laws)
+            assert status == "ok"
+            Y[r] -= np.einsum("lsj,lj->ls", h, G[lines])
+    Y = Y + noise / np.sqrt(2) * (rng.normal(size=Y.shape) + 1j * rng.normal(size=Y.shape))
+    return Spectra(empty.names, "steady", block, rate, 0.0, lines, excited, half[:, lines], Y, np.full(Y.shape, noise ** 2),
+                   empty.force_noise, waves, empty.scatter, levels, empty.starts)
+
+
+def cubic(k: float) -> LawAlong:
+    return LawAlong(lambda d, v, dt: k * d ** 3, lambda d, v: (3 * k * d ** 2, 0 * v))
+
+
+def test_projection_removes_any_linear_change_exactly() -> None:
+    fam = chain_family()
+    spectra = steady(fam, np.zeros(fam.size))
+    evidence = gather(spectra, (1.0, 170.0))
+    rng = np.random.default_rng(1)
+    change = rng.normal(size=len(spectra.lines)) + 1j * rng.normal(size=len(spectra.lines))
+    assert np.abs(evidence.project(change * spectra.force)).max() < 1e-12 * np.abs(change).max() * np.abs(spectra.force).max()
+    other = rng.normal(size=spectra.force.shape) + 1j * rng.normal(size=spectra.force.shape)
+    once = evidence.project(other)
+    assert np.allclose(evidence.project(once), once, rtol=0, atol=1e-12)
+    assert evidence.statistic == pytest.approx(1.0, abs=0.1)
+
+
+def test_receptance_with_attachments_equals_direct_inversion() -> None:
+    fam = chain_family()
+    rng = np.random.default_rng(2)
+    theta = 0.3 * rng.normal(size=fam.size) * fam.prior_sd
+    theta[len(fam.names):] = 0
+    s = 2j * np.pi * np.linspace(3, 150, 7)
+    modes = solve(fam, theta)
+    attach = (Attachment(fam.points["P1"], 0.3 * s ** 2), Attachment(fam.places["J5_slip"], 5e4 + 0 * s))
+    got = fields(fam, modes, s, attach).H
+    scale = np.exp(theta[:4])
+    K = np.tensordot(scale[:3], fam.K_parts, 1) + fam.K_rest
+    M = scale[3] * fam.M_parts[0]
+    C = M @ modes.basis @ np.diag(2 * modes.zeta * modes.omega) @ modes.basis.T @ M
+    for k, sk in enumerate(s):
+        Z = M * sk ** 2 + C * sk + K + sum(a.z[k] * np.outer(a.direction, a.direction) for a in attach)
+        assert np.allclose(got[k], sk ** 2 * fam.sensors @ np.linalg.solve(Z, fam.shaker), rtol=1e-9)
+
+
+def test_jacobian_against_differences() -> None:
+    fam = chain_family()
+    rng = np.random.default_rng(3)
+    theta = 0.5 * rng.normal(size=fam.size) * fam.prior_sd
+    s = 2j * np.pi * np.linspace(3, 150, 40)
+    J = jacobian(fam, theta, fields(fam, solve(fam, theta), s), s)
+    for i in range(fam.size):
+        d = 1e-5 * (np.arange(fam.size) == i)
+        difference = (fields(fam, solve(fam, theta + d), s).H - fields(fam, solve(fam, theta - d), s).H) / 2e-5
+        assert np.linalg.norm(J[i] - difference) < 2e-3 * np.linalg.norm(difference), fam.names[i] if i < 4 else i
+
+
+def test_calibration_recovers_known_multipliers() -> None:
+    fam = chain_family()
+    theta = np.zeros(fam.size)
+    theta[:4] = [0.5, -0.4, 0.35, 0.005]
+    spectra = steady(fam, theta, noise=1e-6)
+    evidence = gather(spectra, (1.0, 170.0))
+    fit = calibrate(fam, spectra.s[spectra.excited], evidence.H, evidence.variance)
+    assert fit.status == "ok"
+    assert np.abs(fit.theta[:3] - theta[:3]).max() < 0.06
+    assert fit.cost < 1.2 * fit.dof
+
+
+def test_vector_fitting_finds_poles_and_shapes() -> None:
+    fam = chain_family()
+    modes = solve(fam, np.zeros(fam.size))
+    s = 2j * np.pi * np.linspace(3, 150, 300)
+    H = receptances(modes, s, fam.sensors, fam.shaker[None])[:, :, 0]
+    true = modes.omega * (-modes.zeta + 1j * np.sqrt(1 - modes.zeta ** 2))
+    inside = modes.omega < 2 * np.pi * 140
+    poles, residues = vector_fit(s, H, np.full(H.shape, 1e-24), 1.07 * true[inside])
+    for p in true[inside]:
+        assert np.abs(poles - p).min() < 1e-3 * np.abs(p)
+    pairs = pair(fam, poles, residues, modes.omega[inside], modes.basis[:, inside])
+    assert sorted(i for i, _ in pairs) == list(range(int(inside.sum())))
+
+
+def test_settled_motion_solves_the_equation_in_time() -> None:
+    """Duffing oscillator: the spectrum found must satisfy M ẍ + C ẋ + K x + k x³ = F on every sample."""
+    fam = chain_family()
+    spectra = steady(fam, np.zeros(fam.size), records=2)
+    modes = solve(fam, np.zeros(fam.size))
+    row = fam.places["J3_slip"]
+    paths = bed(modes, spectra, row[None], fam.shaker)
+    scale = paths.in_time(paths.linear(1))[0].std()
+    law = cubic(0.1 * 4e5 / scale ** 2)
+    D, G, status = settle(paths, 1, (law,))
+    assert status == "ok"
+    assert np.linalg.norm(G * paths.among[:, 0]) > 0.02 * np.linalg.norm(D)
+    q = (1 / modes.denominators(paths.s)) * ((fam.shaker @ modes.basis) * paths.drive[1][:, None] - (row @ modes.basis) * G)
+    d = np.fft.irfft(q @ (row @ modes.basis) * paths.samples, paths.samples)
+    g = np.fft.irfft(G[:, 0] * paths.samples, paths.samples)
+    assert np.abs(d - paths.in_time(D)[0][:, 0]).max() < 1e-3 * np.abs(d).max()
+    assert np.abs(g - law.force(d, d, 0.0)).max() < 5e-3 * np.abs(g).max()
+
+
+def test_gmres_solves_a_real_linear_system() -> None:
+    rng = np.random.default_rng(5)
+    A = np.eye(30) + 0.2 * rng.normal(size=(30, 30))
+    b = rng.normal(size=30)
+    x = gmres(lambda y: (A @ y.real).astype(complex), b.astype(complex), 30, 1e-12)
+    assert np.allclose(A @ x.real, b, atol=1e-9)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_sliders_agree_with_the_library(number: int) -> None:
+    law = ROWS["hysteresis"].laws[number]
+    rng = np.random.default_rng(6)
+    F = np.zeros(1025, dtype=complex)
+    F[5:120] = rng.normal(size=115) + 1j * rng.normal(size=115)
+    d = np.fft.irfft(F, 2048)
+    d /= d.std()
+    v = np.fft.irfft(2j * np.pi * np.arange(1025) * np.fft.rfft(d), 2048)
+    values = law.shapes(Size(1.0, 1.0, 3.0))[3]
+    first = int(np.argmax(np.abs(d)))
+    path = motion(np.append(np.roll(d, -first), d[first]), np.append(np.roll(v, -first), v[first]), 1 / 2048)
+    reference = np.roll(force_along(law.term, path, values, excess=True)[:-1], first)
+    assert np.linalg.norm(along_period(law, values, d, v, 1 / 2048, True) - reference) < 0.02 * np.linalg.norm(reference)
+
+
+def test_effects_pack_and_unpack() -> None:
+    for row in CATALOGUE:
+        for law in row.laws:
+            values = law.shapes(Size(1e-5, 1e-2, 3e-5, 1e6))[1]
+            effect = Effect(row.name, "J1_slip", law, values)
+            assert np.allclose(unpack(effect, pack(effect), effect).values, values)
+    assert all(row["class"] and row["separated by"] for row in catalogue_rows())
+
+
+def test_probabilities_sum_to_one_and_rise_with_gain() -> None:
+    def case(gain: float) -> dict:
+        return probabilities(Scores((Score((("hardening", "TIP_w"),), gain), Score((("clearance", "TIP_w"),), 0.6 * gain))))
+
+    none = []
+    for gain in (1.0, 10.0, 50.0, 300.0, 1e5):
+        found = case(gain)
+        assert sum(found.values()) == pytest.approx(1.0, abs=1e-12)
+        assert (("other", "-"),) in found and () in found
+        none.append(found[()])
+    assert all(a > b for a, b in zip(none[:-1], none[1:], strict=True))
+    wide = probabilities(Scores((Score((("hardening", "A"),), 1000.0), Score((("clearance", "A"),), 100.0))))
+    close = probabilities(Scores((Score((("hardening", "A"),), 1000.0), Score((("clearance", "A"),), 990.0))))
+    assert wide[(("hardening", "A"),)] > close[(("hardening", "A"),)]
+
+
+def test_layer_learns_where_nothing_ends() -> None:
+    rng = np.random.default_rng(8)
+    scores, truths = [], []
+    for i in range(40):
+        real = i % 2 == 0
+        gain = float(np.exp(rng.normal(np.log(2000) if real else np.log(200), 0.4)))
+        scores.append(Scores((Score((("coulomb", "J1_slip"),), gain),)))
+        truths.append((("coulomb", "J1_slip"),) if real else ())
+    layer = fit_layer(scores, truths, Layer())
+    assert 200 < layer.threshold < 2000
+
+
+def test_bands_cover_nine_tenths_and_elpd_knows_the_better_model() -> None:
+    rng = np.random.default_rng(9)
+    true = rng.normal(size=(8000, 2))
+    measured = true + 0.1 * rng.normal(size=true.shape)
+    bands = calibrate_bands(np.full(2, 0.1), [measured], [true], 100.0)
+    assert np.mean(np.abs(measured - true) < bands.factor * bands.sd(true, 100.0)) == pytest.approx(0.9, abs=0.01)
+    poor = 0.8 * true
+    worse = calibrate_bands(np.full(2, 0.1), [measured], [poor], 100.0)
+    gain, se = elpd_difference(measured, poor, true, worse, bands, 100.0)
+    assert gain > 5 * se > 0
+    assert nrmse(measured, true) < nrmse(measured, poor)
