@@ -137,7 +137,8 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     out = np.full((2, len(theta), len(wanted)), np.nan)
     good = status == "ok"
     if good.any():
-        curves = np.stack([w, np.log(action), loss, excess])[:, good]
+        # loss over action is nearly flat, where loss alone grows like the square of the amplitude
+        curves = np.stack([w, np.log(action), loss / action, excess])[:, good]
         finite = np.isfinite(curves).all(axis=(0, 1))
         spline = CubicSpline(log_a[finite], curves[:, :, finite], axis=2)
         # the peak is the prescribed amplitude times exp(excess): go back by that much along the curve
@@ -145,7 +146,7 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
         back = value[3] / (1 + slope[3])
         value, slope = value - slope * back, slope - spline(wanted, 2) * back
         growth = slope[1] / (1 + slope[3])
-        rate = value[2] / (2 * np.pi) / (np.exp(value[1]) * growth)
+        rate = value[2] / (2 * np.pi) / growth
         # zero crossings of a decay come at the damped frequency
         out[0, good], out[1, good] = np.sqrt(np.maximum(value[0] ** 2 - rate**2, 0.0)) / (2 * np.pi), rate / value[0]
     return out[0], out[1], status
