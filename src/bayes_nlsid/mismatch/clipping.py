@@ -29,7 +29,7 @@ def suspects(case: Case) -> list[tuple[int, float]]:
             peaks[record.name] = top
             near, below = int((y > 0.95 * top).sum()), int((y > 0.85 * top).sum())
             crowd = near / max(below, 1)
-            if near > 8 and crowd > 0.42:
+            if near > 8 and crowd > 0.55:
                 best = max(best, (crowd, float(np.median(y[y > 0.95 * top]))))
         if best[0] > 0:
             out.append((i, best[1]))

@@ -207,7 +207,7 @@ def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], 
     if not forces:
         theta, x, _ = descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=x, tol=0.03)
         fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
-        return _hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
+        return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
     unique = repeats(spectra)
     fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
     reference, damping = forces, 1e-2
@@ -227,7 +227,7 @@ def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], 
                 new = finish(fam, theta, s, cleaned, variance, None, x, sd)
         residual = evidence.residual + np.einsum(
             "lsj,rlj->rls", h, np.stack([evidence.project(lines[:, :, j]) for j in range(len(forces))], axis=-1), optimize=True)
-        found = _hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status)
+        found = hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status)
         if best is None or found.cost < best[0]:
             better = best is None or best[0] - found.cost > 1.0 + 1e-3 * found.cost
             best = (found.cost, found)
@@ -253,7 +253,7 @@ def _merge(effects: tuple[Effect, ...], forces: tuple[Effect, ...]) -> tuple[Eff
     return tuple(found.pop(0) if e.is_force else e for e in effects)
 
 
-def _hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKind, ...], fit: LinearFit, misfit: float, curvature: Array,
+def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKind, ...], fit: LinearFit, misfit: float, curvature: Array,
                 residual: Complex, status: str) -> Hypothesis:
     free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
     charge = free * np.log(max(bench.evidence.H.size, 2))
@@ -297,7 +297,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     def effects_at(y: Array) -> tuple[Effect, ...]:
         return tuple(unpack(e, y[a:b], ref) for e, ref, a, b in zip(forces, reference, edges[:-1], edges[1:], strict=True))
 
-    y = np.concatenate([_packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
+    y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
     now = simulate(paths, spectra, forces, unique, warm)
     rest = data - response(now.lines)
     cost = float((np.abs(rest) ** 2).sum())
@@ -330,7 +330,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     return effects_at(y), now.motions, damping, cost, normal, now.lines, h, now.status
 
 
-def _packed(effect: Effect, reference: Effect) -> Array:
+def packed(effect: Effect, reference: Effect) -> Array:
     """Search coordinates of ``effect`` on the scales of ``reference``."""
     if effect.law is None:
         return np.asarray(effect.values / max(float(np.abs(reference.values).max()), 1e-12))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.effects import Effect
 from bayes_nlsid.mismatch.explain import Candidate, Latent, scan_forces, scan_linear
+from bayes_nlsid.mismatch.joint import refine
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate
 
 Array = NDArray[np.float64]
@@ -62,6 +63,11 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         short += _short_linear(bench, linear, band, fit)
     say(f"estimating {len(short)} rivals jointly")
     singles = sorted((estimate(bench, begin if c.effect.is_force else fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    if quiet is not None:
+        # the leaders also from the other calibration: a law that was strong has bent one of the two
+        other = fit if begin is quiet else quiet
+        again = [estimate(bench, other, (c,), rounds=3) for c in [c for c in short if c.effect.is_force][:2]]
+        singles = _better(singles, again)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
@@ -115,16 +121,30 @@ def _short_linear(bench: Bench, candidates: list[Candidate], band: tuple[float, 
     return out
 
 
+def _better(first: list[Hypothesis], second: list[Hypothesis]) -> list[Hypothesis]:
+    """One hypothesis per key, the cheaper of two estimates."""
+    best: dict[tuple, Hypothesis] = {}
+    for h in first + second:
+        key = tuple(e.key for e in h.effects)
+        if key not in best or h.cost < best[key].cost:
+            best[key] = h
+    return sorted(best.values(), key=lambda h: h.cost)
+
+
 def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> list[Hypothesis]:
-    """More rounds for force hypotheses that are still in the race."""
-    if not singles:
+    """Joint iterations for the force hypotheses that are still in the race and leave a misfit; more rounds for the others."""
+    if not singles or none - singles[0].cost < 30:
         return singles
-    best = singles[0].cost
-    gain = none - best
+    gain = none - singles[0].cost
+    values, dof = bench.evidence.values, singles[0].fit.dof
     out = []
     for i, h in enumerate(singles):
-        if i < 3 and h.forces and gain > 30 and h.cost - best < 0.35 * gain:
-            h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=8, globally=True)), key=lambda z: z.cost)
+        poor = h.misfit_records > 1.02 * values or h.fit.cost > 1.1 * dof
+        if h.forces and i < 3 and h.cost - singles[0].cost < 0.3 * gain:
+            if poor and gain > 200 and i < 2:
+                h = refine(bench, h, steps=10)
+            else:
+                h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=4)), key=lambda z: z.cost)
         out.append(h)
     return sorted(out, key=lambda z: z.cost)
 
