@@ -32,7 +32,8 @@ def folder(tmp_path: Path) -> Path:
                         "sealed": False, "f": force})
     for r in records:
         r.pop("f")
-    (tmp_path / "case.json").write_text(json.dumps({"case": "x", "fs_hz": RATE, "period_s": PERIOD, "band_hz": [5, 100], "records": records}))
+    (tmp_path / "case.json").write_text(json.dumps(
+        {"case": "x", "fs_hz": RATE, "period_s": PERIOD, "band_hz": [5, 100], "records": records}))
     return tmp_path
 
 
@@ -96,7 +97,8 @@ def test_degraded_data_become_notes(folder: Path) -> None:
 
 def test_the_answer_is_written_as_agreed(tmp_path: Path) -> None:
     hypotheses = (Named((("none", "-"),), 0.9), Named((("other", "-"),), 0.1))
-    diagnosis = Diagnosis("x", 1, 2.0, "none", 0.1, {"locations": [], "phase": "-"}, hypotheses, {"nrmse_nominal": float("nan")}, "words", {},
+    diagnosis = Diagnosis("x", 1, 2.0, "none", 0.1, {"locations": [], "phase": "-"}, hypotheses, {"nrmse_nominal": float("nan")}, "words",
+                          {},
                           (), {"s_accel_q50": np.zeros((4, 2))}, {"frequency": np.arange(3.0)})
     write_diagnosis(diagnosis, tmp_path / "out")
     stored = json.loads((tmp_path / "out" / "diagnosis.json").read_text())

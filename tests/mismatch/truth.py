@@ -21,16 +21,16 @@ FINER = 8
 
 def beam(length: float, height: float, width: float, E: float, rho: float, count: int) -> tuple[Array, Array]:
     """Stiffness and mass (3 per node: axial u, transverse w, rotation) of a straight beam."""
-    l, A, I = length / count, width * height, width * height ** 3 / 12
+    h, area, inertia = length / count, width * height, width * height ** 3 / 12
     k = np.zeros((6, 6))
     m = np.zeros((6, 6))
     ax, tr = [0, 3], [1, 2, 4, 5]
-    k[np.ix_(ax, ax)] = E * A / l * np.array([[1, -1], [-1, 1]])
-    m[np.ix_(ax, ax)] = rho * A * l / 6 * np.array([[2, 1], [1, 2]])
-    k[np.ix_(tr, tr)] = E * I / l ** 3 * np.array([[12, 6 * l, -12, 6 * l], [6 * l, 4 * l * l, -6 * l, 2 * l * l],
-                                                   [-12, -6 * l, 12, -6 * l], [6 * l, 2 * l * l, -6 * l, 4 * l * l]])
-    m[np.ix_(tr, tr)] = rho * A * l / 420 * np.array([[156, 22 * l, 54, -13 * l], [22 * l, 4 * l * l, 13 * l, -3 * l * l],
-                                                      [54, 13 * l, 156, -22 * l], [-13 * l, -3 * l * l, -22 * l, 4 * l * l]])
+    k[np.ix_(ax, ax)] = E * area / h * np.array([[1, -1], [-1, 1]])
+    m[np.ix_(ax, ax)] = rho * area * h / 6 * np.array([[2, 1], [1, 2]])
+    k[np.ix_(tr, tr)] = E * inertia / h ** 3 * np.array([[12, 6 * h, -12, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h],
+                                                   [-12, -6 * h, 12, -6 * h], [6 * h, 2 * h * h, -6 * h, 4 * h * h]])
+    m[np.ix_(tr, tr)] = rho * area * h / 420 * np.array([[156, 22 * h, 54, -13 * h], [22 * h, 4 * h * h, 13 * h, -3 * h * h],
+                                                      [54, 13 * h, 156, -22 * h], [-13 * h, -3 * h * h, -22 * h, 4 * h * h]])
     K, M = np.zeros((3 * count + 3,) * 2), np.zeros((3 * count + 3,) * 2)
     for i in range(count):
         s = slice(3 * i, 3 * i + 6)
@@ -160,7 +160,8 @@ def refine(signal: Array, shift: float) -> Array:
     return np.fft.irfft(full * FINER, n * FINER)
 
 
-LAWS = {"hardening": 1, "softening": 2, "clearance": 3, "asymmetric": 4, "coulomb": 5, "quad_damping": 6, "hysteresis": 7, "stiffness_drift": 8,
+LAWS = {"hardening": 1, "softening": 2, "clearance": 3, "asymmetric": 4, "coulomb": 5, "quad_damping": 6, "hysteresis": 7,
+        "stiffness_drift": 8,
         "maxwell": 9}
 
 
@@ -218,11 +219,13 @@ def write_case(folder: Path, cls: str = "none", place: str = "-", strength: floa
     np.savez(folder / "nominal.npz", M=nominal_M, K=nominal_K, K_parts=np.array(list(body["K_parts"].values())),
              K_part_names=np.array(list(body["K_parts"])), M_parts=np.array(list(body["M_parts"].values())),
              M_part_names=np.array(list(body["M_parts"])), sensor_select=body["rows"], shaker_vector=body["shaker"],
-             base_vector=body["base"], location_names=np.array(list(body["vectors"])), location_vectors=np.array(list(body["vectors"].values())))
+             base_vector=body["base"], location_names=np.array(list(body["vectors"])),
+             location_vectors=np.array(list(body["vectors"].values())))
     (folder / "case.json").write_text(json.dumps({
         "case": folder.name, "fs_hz": RATE, "period_s": PERIOD, "band_hz": list(BAND), "excited_lines": lines, "line_spacing_hz": 0.5,
         "records": records, "nominal_damping_ratio": 0.007,
-        "tolerances": {"E_rel_sd": 0.03, "rho_rel_sd": 0.008, "joint_stiffness_log_sd": tolerance, "root_fix_log_sd": 0.5, "damping_rel_sd": 0.2},
+        "tolerances": {"E_rel_sd": 0.03, "rho_rel_sd": 0.008, "joint_stiffness_log_sd": tolerance, "root_fix_log_sd": 0.5,
+                       "damping_rel_sd": 0.2},
         "locations": {"joints": list(body["vectors"]), "mass_points": [f"P{i + 1}" for i in range(sensors)] + ["SHAKER"],
                       "sensors": [f"S{i + 1}" for i in range(sensors)], "other": ["FORCE", "BASE", "ALL_SENSORS", "-"]}, "mains_hz": 50.0}))
     return truth
@@ -307,7 +310,8 @@ def _campaign(rng: np.random.Generator, lines: list[int], one_level: bool, burst
             waves[name] = waves["low_1"] if name == "low_2" and not one_level else multisine(level)
     else:
         for i, level in enumerate((0.1, 0.3, 1.0, 1.0, 0.3)):
-            records.append({"name": f"b{i + 1}", "level": level, "kind": "burst random from rest", "start_s": 10.0 + 15 * i, "sealed": False})
+            records.append({"name": f"b{i + 1}", "level": level, "kind": "burst random from rest", "start_s": 10.0 + 15 * i,
+                            "sealed": False})
             waves[f"b{i + 1}"] = burst(level)
     for name, level, sealed in (("burst_1", 1.0, False), ("sealed_ms", 1.0, True), ("sealed_burst", 1.15, True)):
         if name == "sealed_ms" and bursts_only:
@@ -351,7 +355,8 @@ def _tune(plant: dict, modes: tuple[Array, Array], cls: str, place: str, strengt
     reference, _ = _run(plant, modes, strong, f, 0, np.zeros(3), none, place, 1.0)
     n = len(f)
     s = 2j * np.pi * np.arange(n // 2 + 1) * RATE / n
-    D = (plant["vectors"][place] @ shapes * (plant["shaker"] @ shapes) / (s[:, None] ** 2 + 2 * 0.007 * omega * s[:, None] + omega ** 2)).sum(1)
+    lift = plant["vectors"][place] @ shapes * (plant["shaker"] @ shapes)
+    D = (lift / (s[:, None] ** 2 + 2 * 0.007 * omega * s[:, None] + omega ** 2)).sum(1)
     d = np.fft.irfft(D * np.fft.rfft(f), n)
     v = np.fft.irfft(s * D * np.fft.rfft(f), n)
     x, w = d.std(), v.std()

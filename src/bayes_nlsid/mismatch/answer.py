@@ -164,7 +164,8 @@ def _band(analysis: Analysis, best: Rival | None) -> list[float]:
         return [float(analysis.case.band[0]), float(analysis.case.band[1])]
     share = np.cumsum(power) / power.sum()
     f = evidence.spectra.frequency
-    return [float(f[np.searchsorted(share, 0.1)]), float(f[min(np.searchsorted(share, 0.9), len(f) - 1)])]
+    last = len(f) - 1
+    return [float(f[min(int(np.searchsorted(share, p)), last)]) for p in (0.1, 0.9)]
 
 
 def _predict_sealed(analysis: Analysis, predictor: Predictor, proof: Proof) -> dict[str, Array]:
@@ -221,12 +222,12 @@ def _sentence(verdict: str, p: float, hypotheses: tuple[Named, ...], where: dict
     return text
 
 
-def _figures(analysis: Analysis, proof: Proof, odds: dict[Key, float]) -> dict[str, Array]:
+def _figures(analysis: Analysis, proof: Proof, odds: dict[Key, float]) -> dict[str, NDArray[Any]]:
     """Numbers for figures: where, latent force against motion, transfer functions, before and after."""
     evidence, fit = analysis.evidence, analysis.fit
     e = evidence.excited
     latents = sorted(analysis.found.latents, key=lambda x: -x.explained)
-    out: dict[str, Array] = {
+    out: dict[str, NDArray[Any]] = {
         "frequency": evidence.spectra.frequency, "frf_frequency": evidence.spectra.frequency[e], "frf_measured": evidence.H,
         "frf_linear": fit.model, "residual_by_line": np.sqrt((np.abs(evidence.residual) ** 2).mean((0, 2))),
         "noise_by_line": np.sqrt(evidence.spectra.noise.mean((0, 2))), "statistic_by_record": evidence.by_record,

@@ -265,7 +265,8 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
     rest = system.gradient - np.concatenate([prior * theta, (x - extension.centre) / extension.prior_sd ** 2] if extension is not None
                                             else [prior * theta])
     full = system.normal + np.diag(np.concatenate([prior, 1 / extension.prior_sd ** 2]) if extension is not None else prior)
-    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, s, measured, variance, system, rest, misfit, status)
+    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, s, measured, variance,
+                     system, rest, misfit, status)
 
 
 def calibrate(fam: Family, s: Complex, measured: Complex, variance: Array, *, restarts: int = 6, enough: float = 1.1) -> LinearFit:

@@ -120,7 +120,8 @@ SATURATING = Term("saturating_spring", "-k*q*(abs(q)/d)**m/(1 + (abs(q)/d)**m)",
                    Param("d", "m", "displacement", meaning="motion at which half of it is lost"),
                    Param("m", "", "range", 0.5, 4.0, "sharpness")),
                   lambda q, v, k, d, m: -k * q * (np.abs(q) / d) ** m / (1 + (np.abs(q) / d) ** m),
-                  lambda q, v, k, d, m: (-k * (np.abs(q) / d) ** m * (1 + m + (np.abs(q) / d) ** m) / (1 + (np.abs(q) / d) ** m) ** 2, 0 * q),
+                  lambda q, v, k, d, m: (-k * (np.abs(q) / d) ** m * (1 + m + (np.abs(q) / d) ** m) / (1 + (np.abs(q) / d) ** m) ** 2,
+                                         0 * q),
                   meaning="spring that softens with displacement and returns on the same line")
 
 ONE_SIDED = Term("one_sided_spring", "k*where(q > e, q - e, 0)",
@@ -147,7 +148,7 @@ _HARDENING = Law(POWER_SPRING, lambda z: _grid(np.array([1.0]), np.array([z.disp
                  ("log", "fixed", "log"), (0,))
 _SOFTENING = Law(SATURATING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.5, 1.0, 2.0, 5.0]), np.array([1.0, 2.0])),
                  ("log", "log", "log"), (0,))
-_CLEARANCE = Law(LIBRARY["clearance"], lambda z: _grid(np.array([1.0]), 2 * z.displacement * np.array([0.25, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0])),
+_CLEARANCE = Law(LIBRARY["clearance"], lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.5, 1.2, 2.0, 3.0, 4.0, 5.0, 6.0])),
                  ("log", "log"), (0,))
 _ASYMMETRIC = Law(ONE_SIDED, lambda z: _grid(np.array([1.0]), z.displacement * np.array([-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0])),
                   ("linear", "linear"), (0,), signed=True)

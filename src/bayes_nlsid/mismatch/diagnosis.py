@@ -78,7 +78,7 @@ class Diagnosis:
     detection: Mapping[str, float]
     notes: tuple[str, ...] = ()
     predictions: Mapping[str, Array] = field(default_factory=dict)
-    figures: Mapping[str, Array] = field(default_factory=dict)
+    figures: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.verdict not in ("none", "mismatch", "cannot_tell"):
@@ -103,8 +103,10 @@ def write_diagnosis(diagnosis: Diagnosis, out: str | Path) -> None:
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "diagnosis.json").write_text(json.dumps(_plain(diagnosis.as_dict()), indent=1, ensure_ascii=False) + "\n")
-    np.savez_compressed(folder / "predictions.npz", **{k: v.astype(np.float32) for k, v in diagnosis.predictions.items()})
-    np.savez_compressed(folder / "figures.npz", **dict(diagnosis.figures))
+    predictions: dict[str, Any] = {k: v.astype(np.float32) for k, v in diagnosis.predictions.items()}
+    figures: dict[str, Any] = dict(diagnosis.figures)
+    np.savez_compressed(folder / "predictions.npz", **predictions)
+    np.savez_compressed(folder / "figures.npz", **figures)
 
 
 def _plain(value: Any) -> Any:

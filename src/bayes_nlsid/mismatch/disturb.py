@@ -165,7 +165,7 @@ def _scatter(case: Case, spectra: Spectra | None) -> tuple[Complex, Array, Array
 def _coherent(case: Case, fam: Family, modes: Modes, scatter: Complex, frequency: Array, levels: Array, spectra: Spectra | None
               ) -> list[Disturbance]:
     """Incoherent response that moves the whole structure in the pattern of one force or of the floor."""
-    s = 2j * np.pi * frequency
+    s = np.asarray(2j * np.pi * frequency, dtype=complex)
     Q, L, S = scatter.shape
     if S < 3:
         return []
@@ -173,7 +173,7 @@ def _coherent(case: Case, fam: Family, modes: Modes, scatter: Complex, frequency
     usable = (L // width) * width
     patterns: dict[str, Complex] = {}
     if np.abs(fam.base).any():
-        patterns["BASE"] = fam.base_direct + s[:, None] ** 2 * receptances(modes, s, fam.sensors, fam.base[None])[:, :, 0]
+        patterns["BASE"] = np.asarray(fam.base_direct + s[:, None] ** 2 * receptances(modes, s, fam.sensors, fam.base[None])[:, :, 0])
     for place, row in fam.places.items():
         patterns[place] = s[:, None] ** 2 * receptances(modes, s, fam.sensors, row[None])[:, :, 0]
     patterns["FORCE"] = s[:, None] ** 2 * receptances(modes, s, fam.sensors, fam.shaker[None])[:, :, 0]
@@ -199,5 +199,6 @@ def _coherent(case: Case, fam: Family, modes: Modes, scatter: Complex, frequency
     if grows or best != "BASE":
         place = best if best in fam.places else "-"
         value = gains[best] if grows else gains[best] - gains.get("BASE", 0.0)
-        out.append(Disturbance("other", place, max(value, 0.0), sizes[best], "incoherent and growing with level" if grows else "incoherent"))
+        detail = "incoherent and growing with level" if grows else "incoherent"
+        out.append(Disturbance("other", place, max(value, 0.0), sizes[best], detail))
     return out

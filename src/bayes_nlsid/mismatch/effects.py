@@ -85,9 +85,9 @@ def _sliding(law: Law, values: Array, d: Array, bins: int = 14) -> Array:
     span = 1
     while span < shift.shape[-1]:
         # map of pieces i−span+1…i after the one that ends where it begins
-        l, h, m = low[..., span:], high[..., span:], shift[..., span:]
+        lower, upper, m = low[..., span:], high[..., span:], shift[..., span:]
         before_l, before_h, before_m = low[..., :-span], high[..., :-span], shift[..., :-span]
-        new_l, new_h = np.clip(before_l + m, l, h), np.clip(before_h + m, l, h)
+        new_l, new_h = np.clip(before_l + m, lower, upper), np.clip(before_h + m, lower, upper)
         shift = np.concatenate([shift[..., :span], before_m + m], axis=-1)
         low, high = np.concatenate([low[..., :span], new_l], axis=-1), np.concatenate([high[..., :span], new_h], axis=-1)
         span *= 2

@@ -117,7 +117,8 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
     fit = finish(bench.family, theta, joint.s, now.cleaned, joint.variance, joint.ext, x, joint.sd)
     forces = list(joint.effects(y))
     effects = tuple(forces.pop(0) if e.is_force else e for e in h.effects)
-    found = hypothesis(bench, effects, h.kinds, fit, float((np.abs(now.residual) ** 2).sum()), curvature, now.residual / joint.root, now.status)
+    found = hypothesis(bench, effects, h.kinds, fit, float((np.abs(now.residual) ** 2).sum()), curvature, now.residual / joint.root,
+                       now.status)
     return found if found.cost < h.cost else h
 
 

@@ -129,7 +129,8 @@ def family(case: Case) -> Family:
     return Family(names, K_parts, M_parts, T.T @ case.K @ T - K_parts.sum(0), T.T @ case.M @ T - M_parts.sum(0), rows @ T,
                   case.shaker @ T, -(case.M @ case.base) @ T, rows @ case.base,
                   {k: v @ T for k, v in case.places.items()}, {k: v @ T for k, v in case.mass_points.items()},
-                  sd, max(1, min(modes, T.shape[1])), case.damping, _single(K_parts), damping_sd=max(0.25, case.tolerances["damping_rel_sd"]))
+                  sd, max(1, min(modes, T.shape[1])), case.damping, _single(K_parts),
+                  damping_sd=max(0.25, case.tolerances["damping_rel_sd"]))
 
 
 def _single(parts: Array) -> dict[int, Array]:
@@ -281,15 +282,15 @@ def jacobian(fam: Family, theta: Array, fld: Fields, s: Complex) -> Complex:
 def _turning(fam: Family, modes: Modes, near: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """For stiffness and mass: what W has beyond 1 (or s²), as constant and as factor of s, (near, near) each."""
     w, a = modes.omega[:near] ** 2, 2 * modes.zeta[:near] * modes.omega[:near]
-    l = modes.undisturbed[:near] ** 2
-    gap = l[None, :] - l[:, None]
-    same = np.abs(gap) < 1e-9 * l[:, None]
+    e = modes.undisturbed[:near] ** 2
+    gap = e[None, :] - e[:, None]
+    same = np.abs(gap) < 1e-9 * e[:, None]
     gap = np.where(same, 1.0, gap)
-    ratio = w / l
+    ratio = w / e
     k_still = np.where(same, np.diag(ratio), (w[None, :] - w[:, None]) / gap) - np.where(same, np.eye(near), 1.0)
     k_moving = np.where(same, np.diag(ratio * a / (2 * w)), (a[None, :] - a[:, None]) / gap)
-    m_still = np.where(same, 0.0, (l[None, :] * w[:, None] - l[:, None] * w[None, :]) / gap)
-    m_moving = np.where(same, np.diag(a / 2), (l[None, :] * a[:, None] - l[:, None] * a[None, :]) / gap)
+    m_still = np.where(same, 0.0, (e[None, :] * w[:, None] - e[:, None] * w[None, :]) / gap)
+    m_moving = np.where(same, np.diag(a / 2), (e[None, :] * a[:, None] - e[:, None] * a[None, :]) / gap)
     return (k_still, k_moving), (m_still, m_moving)
 
 

@@ -100,7 +100,7 @@ def bed(modes: Modes, spectra: Spectra, rows: Array, shaker: Array, attach: Atta
     block = spectra.block
     samples = finer * block
     count = samples // 2 + 1
-    s = spectra.alpha + 2j * np.pi * np.arange(count) * spectra.rate / block
+    s = np.asarray(spectra.alpha + 2j * np.pi * np.arange(count) * spectra.rate / block, dtype=complex)
     full = receptances(modes, s, rows, np.concatenate([rows, shaker[None]]), attach(s) if attach is not None else ())
     time = spectra.waveforms if waveforms is None else waveforms
     decay = np.exp(-spectra.alpha * np.arange(block) / spectra.rate)
@@ -202,7 +202,7 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
             dx, vx = paths.in_time(x)
             return _mul(inverse, x + _mul(paths.among, paths.to_lines(stiff * dx + damp * vx)))
 
-        step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / error))
+        step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / float(error)))
         length, accepted = 1.0, False
         for _ in range(6):
             trial = _rest(paths, linear, D + length * step, laws)
@@ -231,7 +231,7 @@ def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 38
     K, V = np.fft.rfft(kernel, axis=0), np.fft.rfft(speed, axis=0)
     short = [np.fft.rfft(np.concatenate([k[:window], np.zeros_like(k[:window])]), axis=0) for k in (kernel, speed)]
     g = np.zeros((n, J))
-    for turn in range(1 if not paths.periodic else 4):
+    for _ in range(1 if not paths.periodic else 4):
         change = 0.0
         for first in range(0, n, window):
             here = slice(first, min(first + window, n))
@@ -251,7 +251,8 @@ def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 38
     return found if sound else paths.linear(record)
 
 
-def _window(laws: tuple[LawAlong, ...], d: Array, v: Array, old: Array, guess: Array, short: list[Complex], window: int, dt: float) -> Array:
+def _window(laws: tuple[LawAlong, ...], d: Array, v: Array, old: Array, guess: Array, short: list[Complex], window: int, dt: float
+            ) -> Array:
     """Forces (w, J) of one window such that they are the law along the motion they cause."""
     w = len(d)
 
@@ -309,7 +310,7 @@ def gmres(apply: Callable[[Complex], Complex], right: Complex, most: int, tolera
         hessenberg[k + 1, k] = np.linalg.norm(w)
         target = np.zeros(k + 2)
         target[0] = norm
-        best, *_ = np.linalg.lstsq(hessenberg[:k + 2, :k + 1], target, rcond=None)
+        best = np.asarray(np.linalg.lstsq(hessenberg[:k + 2, :k + 1], target, rcond=None)[0])
         left = np.linalg.norm(hessenberg[:k + 2, :k + 1] @ best - target)
         if left < tolerance * norm or hessenberg[k + 1, k] < 1e-14 * norm:
             break
@@ -333,7 +334,7 @@ def _relax(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
         if not np.isfinite(error):
             break
         if error < best:
-            best, kept = error, (D, G)
+            best, kept = float(error), (D, G)
         if error < tolerance:
             break
         if iteration in (0, 3, 10, 20) or inverse is None:

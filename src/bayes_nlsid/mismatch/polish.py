@@ -20,7 +20,7 @@ from bayes_nlsid.mismatch.catalogue import Size
 from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
-from bayes_nlsid.mismatch.linear import Attachment, Family, receptances, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
 from bayes_nlsid.mismatch.motion import FINER, Bed, LawAlong, bed, settle
 from bayes_nlsid.mismatch.spectra import Spectra
 

@@ -8,7 +8,7 @@ against the leftover, and lets the odds of anything at all rise with the logarit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import final
 
 import numpy as np
@@ -155,4 +155,4 @@ def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer = SH
         return total + 0.05 * float(((x - origin) ** 2).sum())
 
     best = minimize(loss, origin, method="Nelder-Mead", options={"maxiter": 1500, "xatol": 0.02, "fatol": 0.02})
-    return Layer(*np.exp(best.x).tolist(), provenance=provenance or f"fitted on {len(truths)} simulated cases")
+    return replace(Layer(*np.exp(best.x).tolist()), provenance=provenance or f"fitted on {len(truths)} simulated cases")

@@ -52,7 +52,7 @@ class Predictor:
         modes = solve(fam, np.zeros(fam.size)) if self.fit is None else self.fit.fields.modes
         block, waveform = _drive(case, record, modes)
         spectra = _as_spectra(record, block, waveform, case.rate, self.reference)
-        s = 2j * np.pi * np.arange(block // 2 + 1) * case.rate / block
+        s = np.asarray(2j * np.pi * np.arange(block // 2 + 1) * case.rate / block, dtype=complex)
         F = np.fft.rfft(waveform) / block
         parts = ((), None) if self.hypothesis is None else self.hypothesis.parts(self.channels)(s)
         errors = None if self.fit is None else self.fit.shape_errors

@@ -43,7 +43,8 @@ class Found:
     first: tuple[Candidate, ...]
 
 
-def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress, quiet: LinearFit | None = None) -> Found:
+def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress, quiet: LinearFit | None = None
+           ) -> Found:
     """Singles, then pairs that begin with the best single.
 
     ``quiet`` is the calibration to the lowest level, where amplitude-dependent laws sleep: forces are looked for with both.
@@ -179,7 +180,9 @@ def _lead(first: Hypothesis) -> tuple[Candidate, ...]:
         x = first.fit.x[edge:edge + len(k.start)]
         edge += len(k.start)
         logs = e.cls in ("unmodelled_mode",) or e.kind == "maxwell"
-        frequency = float(e.values[1]) if e.cls == "unmodelled_mode" else (1 / (2 * np.pi * float(e.values[1])) if e.kind == "maxwell" else 0.0)
+        frequency = 0.0
+        if logs:
+            frequency = float(e.values[1]) if e.cls == "unmodelled_mode" else 1 / (2 * np.pi * float(e.values[1]))
         out.append(Candidate(replace(e, values=np.zeros(0)), 0.0, float(np.exp(x[0])) if logs else float(x[0]), frequency, _other(k)))
     return tuple(out)
 
