@@ -179,13 +179,18 @@ def _predict_sealed(analysis: Analysis, predictor: Predictor, proof: Proof) -> d
             wave, _ = Predictor(analysis.family, analysis.fit, None, predictor.channels, (), analysis.evidence.spectra).run(case, record)
         half = proof.bands.factor * proof.bands.sd(wave, case.rate)
         full = [_all_channels(case, record, w) for w in (wave - half, wave, wave + half)]
+        if not case.usable.all():
+            blind = predictor.silent(case, record)[:len(record.force)]
+            wide = 1.645 * np.sqrt(np.mean(proof.bands.noise) ** 2 + (np.median(proof.bands.relative) * envelope(blind, case.rate)) ** 2)
+            for k, w in enumerate((blind - wide, blind, blind + wide)):
+                full[k][:, ~case.usable] = w
         for tag, w in zip(("q05", "q50", "q95"), full, strict=True):
             out[f"{record.name}_accel_{tag}"] = w
     return out
 
 
 def _all_channels(case: Case, record: CaseRecord, wave: Array) -> Array:
-    """Put the usable channels into their columns; others are not predicted (zero)."""
+    """Put the usable channels into their columns, zeros into the others."""
     out = np.zeros((len(record.force), len(case.sensors)))
     out[:, case.usable] = wave[:len(out)]
     return out

@@ -44,6 +44,8 @@ class Family:
     damping : float
     single : dict of int to ndarray (n,)
         Stiffness parts of rank one, as b with part = b bᵀ.
+    silent : ndarray (S', n)
+        Channels that were left out of the analysis; their motion can be predicted all the same.
     mode_sd, damping_sd, shape_sd : float
         Log-frequency deviation of one mode; log damping; relative error of one mode at one sensor.
     """
@@ -63,6 +65,7 @@ class Family:
     modes: int
     damping: float
     single: dict[int, Array]
+    silent: Array
     mode_sd: float = 0.003
     damping_sd: float = 0.25
     shape_sd: float = 0.004
@@ -130,6 +133,7 @@ def family(case: Case) -> Family:
                   case.shaker @ T, -(case.M @ case.base) @ T, rows @ case.base,
                   {k: v @ T for k, v in case.places.items()}, {k: v @ T for k, v in case.mass_points.items()},
                   sd, max(1, min(modes, T.shape[1])), case.damping, _single(K_parts),
+                  case.sensor_rows[~case.usable] @ T,
                   damping_sd=max(0.25, case.tolerances["damping_rel_sd"]))
 
 

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored
+from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored, predict
 from bayes_nlsid.mismatch.catalogue import Size
 from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence
@@ -26,6 +26,7 @@ from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+FAINT, FAINT_CHARGE = 0.01, 60.0  # change of response below which a linear effect is charged, and how much
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
 
@@ -256,7 +257,7 @@ def _merge(effects: tuple[Effect, ...], forces: tuple[Effect, ...]) -> tuple[Eff
 def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKind, ...], fit: LinearFit, misfit: float, curvature: Array,
                 residual: Complex, status: str) -> Hypothesis:
     free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
-    charge = free * np.log(max(bench.evidence.H.size, 2))
+    charge = free * np.log(max(bench.evidence.H.size, 2)) + _faint(bench, kinds, fit)
     named, edges = [], 0
     remaining = list(kinds)
     for e in effects:
@@ -270,6 +271,25 @@ def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKin
             e = replace(e, values=np.array([np.exp(fit.theta[i])]), names=("stiffness over nominal",), units=("",))
         named.append(e)
     return Hypothesis(tuple(named), kinds, fit, misfit, misfit + fit.cost + charge, curvature, residual, status)
+
+
+def _faint(bench: Bench, kinds: tuple[LinearKind, ...], fit: LinearFit) -> float:
+    """Charge for linear effects that change the response by less than one per cent.
+
+    Such effects are what errors of the nominal model look like; nobody would call them missing physics without much evidence.
+    """
+    count = len(bench.channels)
+    total, edge = 0.0, 0
+    for i, k in enumerate(kinds):
+        others = kinds[:i] + kinds[i + 1:]
+        both = []
+        for some, x in ((kinds, fit.x), (others, np.delete(fit.x, np.arange(edge, edge + len(k.start))))):
+            fld, chain = predict(bench.family, fit.theta, fit.s, extension(some, count), x)
+            both.append(fld.H if chain is None else chain.apply(fld.H))
+        edge += len(k.start)
+        strength = float(np.linalg.norm(both[0] - both[1]) / max(np.linalg.norm(both[0]), 1e-300))
+        total += FAINT_CHARGE * max(0.0, float(np.log(FAINT / max(strength, 1e-9)))) ** 2
+    return total
 
 
 def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, forces: tuple[Effect, ...], reference: tuple[Effect, ...],

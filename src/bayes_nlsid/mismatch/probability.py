@@ -110,14 +110,19 @@ def probabilities(scores: Scores, layer: Layer = SHIPPED) -> dict[Key, float]:
     something = _rises(best / dispersion ** 0.5, layer.threshold, layer.steepness)
     scale = layer.scale * dispersion + layer.share * max(best, 0.0)
     weights: dict[Key, float] = {}
-    for item in items:
-        prior = float(np.prod([ROWS[cls].prior if cls in ROWS else 1.0 for cls, _ in item.key]))
-        weight = prior * (1 + (best - item.gain) / scale) ** -layer.power
-        if len(item.key) > 1:
-            extra = item.gain - item.alone
-            odds = _rises(extra / dispersion, layer.threshold_second, layer.steepness_second)
-            weight *= odds / max(1 - odds, 1e-12) if odds < 0.5 else odds / max(1 - odds, 0.02)
-        weights[item.key] = max(weights.get(item.key, 0.0), weight)
+    double = _double(items, dispersion, layer)
+    for many in (False, True):
+        group = [i for i in items if (len(i.key) > 1) == many]
+        if not group:
+            continue
+        top = max(i.gain for i in group)
+        raw: dict[Key, float] = {}
+        for item in group:
+            prior = float(np.prod([ROWS[cls].prior if cls in ROWS else 1.0 for cls, _ in item.key]))
+            raw[item.key] = max(raw.get(item.key, 0.0), prior * (1 + (top - item.gain) / scale) ** -layer.power)
+        share = double if many else 1 - double
+        for key, value in raw.items():
+            weights[key] = share * value / sum(raw.values())
     strange: Key = (("other", "-"),)
     odds = sigmoid((scores.unexplained - layer.other_at) / layer.other_width)
     weights[strange] = weights.get(strange, 0.0) + max(max(weights.values()) * odds / max(1 - odds, 1e-3), 1e-4 * max(weights.values()))
@@ -127,6 +132,17 @@ def probabilities(scores: Scores, layer: Layer = SHIPPED) -> dict[Key, float]:
         out[key] = something * weight / total
     norm = sum(out.values())
     return {key: value / norm for key, value in sorted(out.items(), key=lambda kv: -kv[1])}
+
+
+def _double(items: list[Score], dispersion: float, layer: Layer) -> float:
+    """Probability that two effects act rather than one: from what the best pair gains over the better of its members alone."""
+    pairs = [i for i in items if len(i.key) > 1]
+    if not pairs:
+        return 0.0
+    if all(len(i.key) > 1 for i in items):
+        return 1.0
+    best = max(pairs, key=lambda i: i.gain)
+    return _rises((best.gain - best.alone) / dispersion, layer.threshold_second, layer.steepness_second)
 
 
 def _rises(gain: float, threshold: float, steepness: float) -> float:

@@ -5,7 +5,7 @@ Nothing here looks at the accelerations it predicts. The width of the bands come
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -37,6 +37,8 @@ class Predictor:
     clip : tuple of (channel index, level m/s²), one for each clipped channel
     reference : Spectra
         Fitted records: the time scale of drifts.
+    chained : bool
+        Whether the measuring chain of the hypothesis applies.
     """
 
     family: Family
@@ -45,6 +47,13 @@ class Predictor:
     channels: int
     clip: tuple[tuple[int, float], ...]
     reference: Spectra
+    chained: bool = True
+
+    def silent(self, case: Case, record: CaseRecord) -> Array:
+        """Accelerations (n, S') of the channels that were left out, as the model has them."""
+        fam = replace(self.family, sensors=self.family.silent)
+        fit = None if self.fit is None else replace(self.fit, shape_errors=np.zeros((len(fam.sensors), fam.modes)))
+        return replace(self, family=fam, fit=fit, clip=(), chained=False).run(case, record)[0]
 
     def run(self, case: Case, record: CaseRecord) -> tuple[Array, str]:
         """Accelerations (n, S) of the usable channels and a status."""
@@ -69,7 +78,7 @@ class Predictor:
             laws = tuple(law_of(e, float(np.clip(time, -1.0, 1.6)), paths.periodic) for e in forces)
             _, G, status = settle(paths, 0, laws, most=60)
             Y = Y - np.einsum("lsj,lj->ls", accelerance(fam, modes, s, rows, errors, parts[0]), G[:len(s)])
-        if parts[1] is not None:
+        if parts[1] is not None and self.chained:
             Y = parts[1].apply(Y)
         wave = np.fft.irfft(Y * block, block, axis=0)
         n = len(record.force)
