@@ -15,25 +15,34 @@ from bayes_nlsid.mismatch.linear import Family
 Array = NDArray[np.float64]
 
 
-def suspects(case: Case) -> list[tuple[int, float]]:
-    """Channels (index among usable ones) whose largest values crowd at one level, and that level, m/s²."""
+def suspects(case: Case, noise: Array) -> list[tuple[int, float]]:
+    """Channels (index among usable ones) whose largest values crowd at one level, and that level, m/s²; the most crowded first.
+
+    A flat top piles values up within the noise of the largest one: there are then many more of them than in the band just below.
+
+    Parameters
+    ----------
+    noise : (S,) rms of the noise of the usable channels, m/s².
+    """
     out = []
     for i, channel in enumerate(np.flatnonzero(case.usable)):
-        best = (0.0, 0.0)
-        peaks = {}
+        crowd, level = 0.0, 0.0
         for record in case.records:
             if record.sealed or record.kind == "off":
                 continue
-            y = np.abs(record.accel[:, channel])
-            top = float(y.max())
-            peaks[record.name] = top
-            near, below = int((y > 0.95 * top).sum()), int((y > 0.85 * top).sum())
-            crowd = near / max(below, 1)
-            if near > 8 and crowd > 0.55:
-                best = max(best, (crowd, float(np.median(y[y > 0.95 * top]))))
-        if best[0] > 0:
-            out.append((i, best[1]))
-    return out
+            y = np.abs(record.accel[:len(record.accel) // record.periods, channel])
+            # only turning points count: a single smooth peak also has many samples near its top
+            y = y[1:-1][(y[1:-1] >= y[:-2]) & (y[1:-1] >= y[2:])]
+            top = float(np.sort(y)[-3:].min()) if len(y) > 30 else np.inf
+            for width in (2 * noise[i], 5 * noise[i], 0.01 * top):
+                if width > 0.15 * top:
+                    continue
+                near, below = int((y > top - width).sum()), int(((y > top - 2.5 * width) & (y <= top - 1.5 * width)).sum())
+                if near >= 8 and near > 2.5 * (below + 2) and near / (below + 1) > crowd:
+                    crowd, level = near / (below + 1), float(np.median(y[y > top - width]))
+        if crowd > 0:
+            out.append((crowd, i, level))
+    return [(i, level) for _, i, level in sorted(out, reverse=True)]
 
 
 def undo(evidence: Evidence, fit: LinearFit, channel: int, level: float) -> Evidence:

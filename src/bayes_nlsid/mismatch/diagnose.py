@@ -93,7 +93,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
     """Everything but the words: evidence, calibration, all rivals with their gains."""
     notes = list(case.notes)
     spectra, held, floor = _groups(case, notes)
-    evidence = gather(spectra, case.band)
+    evidence = gather(spectra, case.band, case.mains)
     fam = family(case)
     say("calibrating the linear model")
     linear = not evidence.statistic > 1.1
@@ -108,7 +108,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
         one = _rival(h, found.none)
         alone = max([best_alone.get((k,), -np.inf) for k in one.key] + [rivals[0].gain if rivals else 0.0])
         rivals.append(replace(one, alone=max(alone, 0.0)))
-    rivals += _clipping(case, bench, fit, found.none, places, rivals, say)
+    rivals += _clipping(case, bench, fit, found.none, places, rivals, floor, say)
     rivals = _disturbed(disturbances(case, spectra if spectra.kind == "steady" else None, fam, fit.fields.modes), rivals, case)
     rivals.sort(key=lambda r: -r.gain)
     return Analysis(case, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals), found, held, floor, tuple(notes))
@@ -171,10 +171,11 @@ def _rival(h: Hypothesis, none: float) -> Rival:
     return Rival(tuple(sorted(e.key for e in h.effects)), none - h.cost, 0.0, h)
 
 
-def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: list[str], rivals: list[Rival], say: Progress) -> list[Rival]:
+def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: list[str], rivals: list[Rival], noise: Array,
+              say: Progress) -> list[Rival]:
     """Clipped channels, alone and together with what the unclipped evidence then shows."""
     out: list[Rival] = []
-    for channel, level in suspects(case)[:3]:
+    for channel, level in suspects(case, noise)[:2]:
         say(f"undoing the clipping of {bench.channels[channel]}")
         level, cleaned, refit, cost = fit_clipping(bench.family, bench.evidence, fit, channel, level)
         gain = none - cost

@@ -84,8 +84,8 @@ class Evidence:
         return np.asarray(np.where(self.excited, top / np.where(bottom > 0, bottom, 1), 0))
 
 
-def gather(spectra: Spectra, band: tuple[float, float]) -> Evidence:
-    """Project a group of records; see :class:`Evidence`."""
+def gather(spectra: Spectra, band: tuple[float, float], mains: float = 0.0) -> Evidence:
+    """Project a group of records; see :class:`Evidence`. Lines without force at multiples of ``mains`` (Hz) carry no weight."""
     F, Y = spectra.force, spectra.response
     noise_of_record = spectra.noise.mean((1, 2))
     trust = noise_of_record.mean() / noise_of_record
@@ -111,7 +111,10 @@ def gather(spectra: Spectra, band: tuple[float, float]) -> Evidence:
     distortion = np.maximum(size - variance, 0) if records > 1 else np.zeros_like(variance)
     total = variance + CANDIDATE_ERROR ** 2 * distortion
     variance_H = (variance + 0.1 * distortion)[excited] / safe[excited, None]
-    return Evidence(spectra, trust, 1 / total, residual, H[excited], variance_H, statistic, odd, even, by_record)
+    hum = np.zeros(len(frequency), dtype=bool)
+    if mains > 0 and spectra.kind == "steady":
+        hum = (np.abs(frequency / mains - np.round(frequency / mains)) * mains < 0.6 * spectra.rate / spectra.block) & ~excited
+    return Evidence(spectra, trust, np.where(hum[:, None], 1e-9, 1.0) / total, residual, H[excited], variance_H, statistic, odd, even, by_record)
 
 
 def quiet_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:

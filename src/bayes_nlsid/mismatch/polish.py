@@ -287,7 +287,7 @@ def _faint(bench: Bench, kinds: tuple[LinearKind, ...], fit: LinearFit) -> float
             fld, chain = predict(bench.family, fit.theta, fit.s, extension(some, count), x)
             both.append(fld.H if chain is None else chain.apply(fld.H))
         edge += len(k.start)
-        strength = float(np.linalg.norm(both[0] - both[1]) / max(np.linalg.norm(both[0]), 1e-300))
+        strength = float(np.linalg.norm(both[0] - both[1])) / max(float(np.linalg.norm(both[0])), 1e-300)
         total += FAINT_CHARGE * max(0.0, float(np.log(FAINT / max(strength, 1e-9)))) ** 2
     return total
 
