@@ -92,7 +92,7 @@ def test_compiles_without_a_place_for_its_cache(tmp_path, monkeypatch: pytest.Mo
     file = tmp_path / "a file, no directory"
     file.write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(file))
-    assert compiled._cache_directory(memory.__file__) == ""
+    assert compiled.cache_directory(memory.__file__) == ""
     assert compiled.compiled(memory.slider_step)(0.5, 0.0, 0.0, 1.0, 1.0) == (0.5, 0.0)
 
 
@@ -102,7 +102,7 @@ def test_cache_changes_its_name_with_the_sources(tmp_path, monkeypatch: pytest.M
     names = set()
     for text in ("a = 1", "a = 2", "a = 1"):
         source.write_text(text)
-        names.add(compiled._cache_directory(str(source)))
+        names.add(compiled.cache_directory(str(source)))
     assert len(names) == 2 and all(name.startswith(str(tmp_path)) for name in names)
 
 

@@ -74,10 +74,17 @@ def test_power_without_a_call_is_the_power() -> None:
     assert np.abs(out / exact - 1).max() < 3e-13
 
 
-def test_compiling_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_is_announced_when_it_must_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    from bayes_nlsid.simulation import compiled_loop
+
     said: list[str] = []
+    for _ in range(2):
+        simulate(oscillator("cubic"), [[1e3]], fs=100, samples=5, u0=[0.1], compiled=True, progress=said.append)
+    assert len(said) < 2 and compiled_loop.ready()
+    said.clear()
+    monkeypatch.setattr(compiled_loop, "ready", lambda: False)
     simulate(oscillator("cubic"), [[1e3]], fs=100, samples=5, u0=[0.1], compiled=True, progress=said.append)
-    assert len(said) == 1 and "compile" in said[0]
+    assert len(said) == 1 and "compiling" in said[0]
     monkeypatch.setenv("BAYES_NLSID_COMPILED", "0")
     assert not simulate(oscillator("cubic"), [[1e3]], fs=100, samples=5, u0=[0.1], compiled=True).compiled
 

@@ -22,13 +22,18 @@ from bayes_nlsid.forces import laws, memory
 from bayes_nlsid.forces.term import Term
 
 
-def _cache_directory(source: str) -> str:
+def cache_directory(source: str) -> str:
     """A writable directory for compiled code of these very sources, or "" if there is none.
 
     numba looks at the age of one file only; a law edited elsewhere would leave stale code. The name of the directory therefore
-    holds a hash of all sources that compiled code is made from.
+    holds a hash of all sources that compiled code is made from, and of numba's version.
+
+    Parameters
+    ----------
+    source : str
+        File of the function to compile.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(numba.__version__.encode())
     for module in (laws.__file__, memory.__file__, __file__, source):
         digest.update(Path(module).read_bytes())
     beside, home = Path(__file__).parent / "__pycache__", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "bayes_nlsid"
@@ -46,7 +51,7 @@ def _cache_directory(source: str) -> str:
 
 def compiled(function: Callable[..., Any]) -> Any:
     """The function compiled by numba, kept on disk if a directory can be written, else compiled anew in each process."""
-    directory = _cache_directory(inspect.getfile(function))
+    directory = cache_directory(inspect.getfile(function))
     settings: Any = numba.config
     before, settings.CACHE_DIR = settings.CACHE_DIR, directory
     try:

@@ -29,7 +29,7 @@ law_value, masing_walk, sliders_walk, bouc_wen_walk = forces.law_value, forces.m
 
 def _cache_directory(function: Callable[..., Any]) -> str:
     """Where compiled code of these very sources is kept, or "" if nothing can be written."""
-    base = forces._cache_directory(inspect.getfile(function))
+    base = forces.cache_directory(inspect.getfile(function))
     if not base:
         return ""
     digest = hashlib.sha256()
@@ -43,15 +43,20 @@ def _cache_directory(function: Callable[..., Any]) -> str:
     return str(directory)
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def kernel(function: Callable[..., Any], **more: Any) -> Any:
     """The function compiled with fused multiply-add, kept on disk where a directory can be written."""
     directory = _cache_directory(function)
     config: Any = numba.core.config
     before, config.CACHE_DIR = config.CACHE_DIR, directory
     try:
-        return numba.njit(cache=bool(directory), error_model="numpy", fastmath={"contract"}, nogil=True)(function)
+        return numba.njit(cache=bool(directory), error_model="numpy", fastmath={"contract"}, nogil=True, **more)(function)
     finally:
         config.CACHE_DIR = before
+
+
+def inner(function: Callable[..., Any]) -> Any:
+    """As ``kernel`` for what only other kernels call: without the wrappers for Python, which take longer to compile than the function."""
+    return kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 _intrinsic: Any = numba.extending.intrinsic
@@ -99,7 +104,7 @@ def power_of(r: np.ndarray, m: np.ndarray, out: np.ndarray) -> None:
 # --- forces -------------------------------------------------------------------------------------------------------------------
 
 
-@kernel
+@inner
 def _iwan(e: int, c: np.ndarray, x: np.ndarray, bent: np.ndarray, f: np.ndarray, slope: np.ndarray) -> None:
     """Backbone and slope of four- and five-parameter Iwan laws in lanes; c (E, 5, lanes): k_t, share, exponent, 1/phi_max, sliding force.
 
@@ -113,21 +118,25 @@ def _iwan(e: int, c: np.ndarray, x: np.ndarray, bent: np.ndarray, f: np.ndarray,
         slope[n] = c[e, 0, n] * (1.0 - (c[e, 2, n] + 1.0) * bent[n]) if abs(x[n]) * c[e, 3, n] < 1.0 else 0.0
 
 
-@kernel
-def one_entry(el: Elements, mem: Memory, e: int, n: int, q: float, v: float, write: bool) -> tuple[float, float, float]:
-    """Force and slopes of one entry in one lane by the scalar blocks; with ``write`` the history goes on to here."""
-    kind = el.kind[e]
+@inner
+def one_entry(el: Elements, mem: Memory, e: int, n: int, q: float, v: float, writing: float) -> tuple[float, float, float]:
+    """Force and slopes of one entry in one lane by the scalar blocks; with ``writing`` > 0 the history goes on to here.
+
+    ``writing`` is no bool because numba compiles a function anew for each constant bool.
+    """
+    kind, fv, write = el.kind[e], 0.0, writing > 0.0
+    last = np.empty(4)
+    for i in range(4):
+        last[i] = mem.last[i, e, n]
     if kind == STATIC:
         f, fq, fv = law_value(el.code[e], el.power[e], q, v, el.p[e, n])
     elif kind == MASING:
-        last, origin, base, doubled = mem.last[:, e, n].copy(), mem.origin[e, n], mem.base[e, n], 1.0 / mem.half[e, n]
+        origin, base, doubled = mem.origin[e, n], mem.base[e, n], 1.0 / mem.half[e, n]
         # the force at the last instant is only looked up at a reversal, so it is brought up to date here
         last[2] = base + doubled * law_value(el.code[e], el.power[e], (last[0] - origin) / doubled, 0.0, el.p[e, n])[0]
         f, fq, depth, overflow = masing_walk(el.code[e], el.power[e], el.p[e, n], last, mem.depth[e, n], mem.ends[e, n], mem.forces[e, n],
                                              q, v, mem.dt, write)
-        fv = 0.0
         if write:
-            mem.last[:, e, n] = last
             mem.depth[e, n] = depth
             origin, base, half, far = 0.0, 0.0, 1.0, math.inf * last[3]
             if depth > 0:
@@ -136,20 +145,17 @@ def one_entry(el: Elements, mem: Memory, e: int, n: int, q: float, v: float, wri
             mem.origin[e, n], mem.base[e, n], mem.half[e, n], mem.far[e, n] = origin, base, half, far
     elif kind == SLIDERS:
         s = mem.slot[e]
-        last = mem.last[:, e, n].copy()
         f, fq = sliders_walk(mem.theta[s, n], mem.stiffness[s, n], mem.slip[s, n], last, mem.stretch[s, n], mem.sliding[s, n], q, v, mem.dt,
                              write)
-        mem.last[:, e, n] = last
-        fv = 0.0
     else:
-        last = mem.last[:, e, n].copy()
         f, fq = bouc_wen_walk(el.p[e, n], last, q, v, mem.dt, write)
-        mem.last[:, e, n] = last
-        fv = 0.0
+    if write:
+        for i in range(4):
+            mem.last[i, e, n] = last[i]
     return f - el.spring[e, n] * q, fq - el.spring[e, n], fv
 
 
-@kernel
+@inner
 def _off_branch(e: int, last: np.ndarray, far: np.ndarray, q: np.ndarray, v: np.ndarray, off: np.ndarray) -> int:
     """Mark the lanes in which a Masing entry leaves its branch by a reversal or by closing a loop; returns how many."""
     count = 0.0
@@ -175,35 +181,34 @@ def evaluate(el: Elements, mem: Memory, q: np.ndarray, v: np.ndarray, f: np.ndar
     x, a, b, bent, off = work[0], work[1], work[2], work[3], work[4]
     for e in range(len(el.kind)):
         r = el.row[e]
+        single = lanes
         if not el.fast[e]:
             for n in range(lanes):
-                one = one_entry(el, mem, e, n, q[r, n], v[r, n], False)
-                f[r, n] += one[0]
-                fq[r, n] += one[1]
-                fv[r, n] += one[2]
+                off[n] = 1.0
         elif el.kind[e] == STATIC:
+            single = 0
             _iwan(e, el.coefficient, q[r], bent, a, b)
             for n in range(lanes):
-                f[r, n] += a[n] - el.spring[e, n] * q[r, n]
-            for n in range(lanes):
-                fq[r, n] += b[n] - el.spring[e, n]
+                a[n] -= el.spring[e, n] * q[r, n]
         else:
             for n in range(lanes):
                 x[n] = (q[r, n] - mem.origin[e, n]) * mem.half[e, n]
             _iwan(e, el.coefficient, x, bent, a, b)
             for n in range(lanes):
                 a[n] = mem.base[e, n] + a[n] / mem.half[e, n] - el.spring[e, n] * q[r, n]
+            single = _off_branch(e, mem.last, mem.far, q[r], v[r], off)
+        if el.fast[e]:
             for n in range(lanes):
                 b[n] -= el.spring[e, n]
-            if _off_branch(e, mem.last, mem.far, q[r], v[r], off):
-                for n in range(lanes):
-                    if off[n] > 0.0:
-                        one = one_entry(el, mem, e, n, q[r, n], v[r, n], False)
-                        a[n], b[n] = one[0], one[1]
+        if single:
             for n in range(lanes):
-                f[r, n] += a[n]
-            for n in range(lanes):
-                fq[r, n] += b[n]
+                if off[n] > 0.0:
+                    a[n], b[n], slope = one_entry(el, mem, e, n, q[r, n], v[r, n], 0.0)
+                    fv[r, n] += slope
+        for n in range(lanes):
+            f[r, n] += a[n]
+        for n in range(lanes):
+            fq[r, n] += b[n]
 
 
 @kernel
@@ -217,7 +222,7 @@ def commit(el: Elements, mem: Memory, q: np.ndarray, v: np.ndarray, off: np.ndar
         if el.kind[e] != MASING or _off_branch(e, last, mem.far, q[r], v[r], off):
             for n in range(q.shape[1]):
                 if el.kind[e] != MASING or off[n] > 0.0:
-                    one_entry(el, mem, e, n, q[r, n], v[r, n], True)
+                    one_entry(el, mem, e, n, q[r, n], v[r, n], 1.0)
                     deepest = max(deepest, mem.depth[e, n])
         if el.kind[e] == MASING:  # harmless where the scalar step has done it already
             for n in range(q.shape[1]):

@@ -8,18 +8,20 @@ where all lanes share the linear part. What each array means stands in ``lanes.p
 from __future__ import annotations
 
 import math
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayes_nlsid.simulation.compiled import commit, evaluate, kernel, one_entry
+from bayes_nlsid.simulation.compiled import commit, evaluate, inner, kernel, one_entry
 from bayes_nlsid.simulation.lanes import Elements, Linear, Memory, Motion
 from bayes_nlsid.simulation.stepping import ACCEPT, CONVERGED, MOST_ITERATIONS, SMALLEST_CONTRACTION
 
 # --- the linear part ----------------------------------------------------------------------------------------------------------
 
 
-@kernel
+@inner
 def _predict(shared: bool, a: np.ndarray, old: np.ndarray, x: np.ndarray, f: np.ndarray, y: np.ndarray) -> None:
     components, modes, lanes = x.shape
     for k in range(modes):
@@ -40,7 +42,7 @@ def _predict(shared: bool, a: np.ndarray, old: np.ndarray, x: np.ndarray, f: np.
                         y[i, k, n] += a[k, i, 2, n] * x[2, k, n]
 
 
-@kernel
+@inner
 def _push(lin: Linear, p: np.ndarray, y: np.ndarray) -> None:
     """Add the applied modal force p (m, 1 or lanes) at the end of the step."""
     components, modes, lanes = y.shape
@@ -50,7 +52,7 @@ def _push(lin: Linear, p: np.ndarray, y: np.ndarray) -> None:
                 y[i, k, n] += lin.new[k, i, 0 if lin.shared else n] * p[k, 0 if p.shape[1] == 1 else n]
 
 
-@kernel
+@inner
 def _rows(b: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
     """out = b x, five columns at a time."""
     rows, columns = b.shape
@@ -75,7 +77,7 @@ def _rows(b: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
                 out[r, n] += b0 * x[k, n]
 
 
-@kernel
+@inner
 def _give(shared: bool, s: np.ndarray, square: np.ndarray, g: np.ndarray, out: np.ndarray) -> None:
     """out = S g."""
     if shared:
@@ -89,7 +91,7 @@ def _give(shared: bool, s: np.ndarray, square: np.ndarray, g: np.ndarray, out: n
                 out[r, n] += s[r, t, n] * g[t, n]
 
 
-@kernel
+@inner
 def _moved(shared: bool, s: np.ndarray, square: np.ndarray, start: np.ndarray, g: np.ndarray, q: np.ndarray) -> None:
     """q = start − S g."""
     _give(shared, s, square, g, q)
@@ -98,7 +100,7 @@ def _moved(shared: bool, s: np.ndarray, square: np.ndarray, start: np.ndarray, g
             q[r, n] = start[r, n] - q[r, n]
 
 
-@kernel
+@inner
 def _correct(shared: bool, new: np.ndarray, y: np.ndarray, back: np.ndarray, p: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
     components, modes, lanes = x.shape
     for k in range(modes):
@@ -117,10 +119,17 @@ def _correct(shared: bool, new: np.ndarray, y: np.ndarray, back: np.ndarray, p: 
                 f[k, n] += p[k, 0 if p.shape[1] == 1 else n]
 
 
+@inner
+def _copy(source: np.ndarray, target: np.ndarray) -> None:
+    for r in range(source.shape[0]):
+        for n in range(source.shape[1]):
+            target[r, n] = source[r, n]
+
+
 # --- Newton in one lane -------------------------------------------------------------------------------------------------------
 
 
-@kernel
+@inner
 def _eliminate(a: np.ndarray, b: np.ndarray) -> None:
     """Solve a x = b in place of b, with pivoting; a zero pivot leaves the entry as it is."""
     size = len(b)
@@ -147,10 +156,12 @@ def _eliminate(a: np.ndarray, b: np.ndarray) -> None:
             b[i] /= a[i, i]
 
 
-@kernel
+@inner
 def _residual(lin: Linear, el: Elements, mem: Memory, n: int, q0: np.ndarray, v0: np.ndarray, g: np.ndarray, at: np.ndarray) -> None:
     """at (4, R): e = f − g, its slopes by q and v, and the force f itself, in lane n at the joint forces g (R,)."""
-    at[:] = 0.0
+    for i in range(4):
+        for r in range(len(g)):
+            at[i, r] = 0.0
     w = 0 if lin.shared else n
     size = len(g)
     for e in range(len(el.kind)):
@@ -159,7 +170,7 @@ def _residual(lin: Linear, el: Elements, mem: Memory, n: int, q0: np.ndarray, v0
         for t in range(size):
             q -= lin.sq[r, t, w] * g[t]
             v -= lin.sv[r, t, w] * g[t]
-        f, fq, fv = one_entry(el, mem, e, n, q, v, False)
+        f, fq, fv = one_entry(el, mem, e, n, q, v, 0.0)
         at[3, r] += f
         at[1, r] += fq
         at[2, r] += fv
@@ -167,16 +178,17 @@ def _residual(lin: Linear, el: Elements, mem: Memory, n: int, q0: np.ndarray, v0
         at[0, r] = at[3, r] - g[r]
 
 
-@kernel
-def _excess(lin: Linear, mot: Motion, n: int, e: np.ndarray) -> float:
-    """Largest change of q or v that e would make, relative to the largest motion so far (R,)."""
+@inner
+def _excess(lin: Linear, mot: Motion, n: int, at: np.ndarray) -> float:
+    """Largest change of q or v that e = at[0] would make, relative to the largest motion so far (R,)."""
     w = 0 if lin.shared else n
     worst = 0.0
-    for r in range(len(e)):
+    size = at.shape[1]
+    for r in range(size):
         dq, dv = 0.0, 0.0
-        for t in range(len(e)):
-            dq += lin.sq[r, t, w] * e[t]
-            dv += lin.sv[r, t, w] * e[t]
+        for t in range(size):
+            dq += lin.sq[r, t, w] * at[0, t]
+            dv += lin.sv[r, t, w] * at[0, t]
         if abs(dq) > 0.0:
             worst = max(worst, abs(dq) / max(mot.scale_q[r, n], 1e-300))
         if lin.velocity and abs(dv) > 0.0:
@@ -184,24 +196,27 @@ def _excess(lin: Linear, mot: Motion, n: int, e: np.ndarray) -> float:
     return worst
 
 
-@kernel
+@inner
 def _newton(lin: Linear, el: Elements, mem: Memory, mot: Motion, n: int, q0: np.ndarray, v0: np.ndarray, g: np.ndarray) -> None:
     """Converged Newton with line search in lane n; g (R, lanes) enters as the guess and leaves as the solution."""
     size, w = len(g), 0 if lin.shared else n
-    here, change, attempt = g[:, n].copy(), np.empty(size), np.empty(size)
-    at, tried, matrix = np.empty((4, size)), np.empty((4, size)), np.empty((size, size))
-    _residual(lin, el, mem, n, q0, v0, here, at)
-    for _ in range(MOST_ITERATIONS):
-        mot.iterations[n] += 1
-        merit = 0.0
-        for r in range(size):
-            change[r] = at[0, r]
-            merit += at[0, r] ** 2
-            for t in range(size):
-                matrix[r, t] = at[1, r] * lin.sq[r, t, w] + at[2, r] * lin.sv[r, t, w] + (1.0 if r == t else 0.0)
-        _eliminate(matrix, change)
+    here, change, attempt = np.empty(size), np.zeros(size), np.empty(size)
+    at, tried, matrix = np.zeros((4, size)), np.empty((4, size)), np.empty((size, size))
+    for r in range(size):
+        here[r] = g[r, n]
+    merit, small = math.inf, False
+    for iteration in range(MOST_ITERATIONS + 1):
+        # the first pass only evaluates at the guess; one place that evaluates keeps the compiled code short
+        if iteration > 0:
+            mot.iterations[n] += 1
+            merit = 0.0
+            for r in range(size):
+                change[r] = at[0, r]
+                merit += at[0, r] ** 2
+                for t in range(size):
+                    matrix[r, t] = at[1, r] * lin.sq[r, t, w] + at[2, r] * lin.sv[r, t, w] + (1.0 if r == t else 0.0)
+            _eliminate(matrix, change)
         length = 1.0
-        small = False
         for _search in range(12):
             total = 0.0
             for r in range(size):
@@ -209,11 +224,13 @@ def _newton(lin: Linear, el: Elements, mem: Memory, mot: Motion, n: int, q0: np.
             _residual(lin, el, mem, n, q0, v0, attempt, tried)
             for r in range(size):
                 total += tried[0, r] ** 2
-            small = _excess(lin, mot, n, tried[0]) <= CONVERGED or not math.isfinite(total)
+            small = iteration > 0 and (_excess(lin, mot, n, tried) <= CONVERGED or not math.isfinite(total))
             if small or not total > merit * (1 - 1e-4 * length):
                 break
             length *= 0.5
-        here[:], at[:] = attempt, tried
+        for r in range(size):
+            here[r] = attempt[r]
+        _copy(tried, at)
         if small:
             break
     else:
@@ -225,7 +242,7 @@ def _newton(lin: Linear, el: Elements, mem: Memory, mot: Motion, n: int, q0: np.
 # --- the loop -----------------------------------------------------------------------------------------------------------------
 
 
-@kernel
+@inner
 def _doubts(lin: Linear, mot: Motion, q: np.ndarray, v: np.ndarray, fq: np.ndarray, fv: np.ndarray, eq: np.ndarray, ev: np.ndarray) -> bool:
     """Bring the scales up to date, mark lanes whose residual is too large for the first-order correction."""
     size, lanes = q.shape
@@ -257,7 +274,7 @@ def _doubts(lin: Linear, mot: Motion, q: np.ndarray, v: np.ndarray, fq: np.ndarr
     return worst > 0.0
 
 
-@kernel
+@inner
 def _attempt(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarray) -> bool:
     """One evaluation at the guess mot.g with a first-order correction into mot.new; whether any lane is in doubt."""
     q0, v0, q, v, f, fq, fv, e, eq, ev = work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7], work[8], work[9]
@@ -281,27 +298,7 @@ def _attempt(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarr
     return _doubts(lin, mot, q, v, fq, fv, eq, ev)
 
 
-@kernel
-def begin(lin: Linear, el: Elements, mem: Memory, q: np.ndarray, v: np.ndarray, parts: int, f: np.ndarray) -> None:
-    """Load every history from rest to q along a straight path; f becomes the force at q, v (R, lanes)."""
-    still = np.zeros_like(v)
-    for i in range(parts):
-        commit(el, mem, q * ((i + 1) / parts), v if i + 1 == parts else still, np.zeros(q.shape[1]))
-    f[:] = 0.0
-    for e in range(len(el.kind)):
-        r = el.row[e]
-        for n in range(q.shape[1]):
-            f[r, n] += one_entry(el, mem, e, n, q[r, n], v[r, n], False)[0]
-
-
-@kernel
-def _copy(source: np.ndarray, target: np.ndarray) -> None:
-    for r in range(source.shape[0]):
-        for n in range(source.shape[1]):
-            target[r, n] = source[r, n]
-
-
-@kernel
+@inner
 def _guess(mot: Motion) -> None:
     """Extrapolate the joint forces through the last three steps, once there are three."""
     _copy(mot.before, mot.older)
@@ -315,7 +312,7 @@ def _guess(mot: Motion) -> None:
     mot.age[0] += 1
 
 
-@kernel
+@inner
 def _store(lin: Linear, mot: Motion, rows: np.ndarray, k: int, outs: tuple[Any, ...], acceleration: np.ndarray) -> None:
     if len(outs[0]):
         _rows(rows, mot.x[0], outs[0][k])
@@ -351,15 +348,17 @@ def advance(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarra
             if lin.velocity:
                 _rows(lin.b, y[1], v0)
             _guess(mot)
-            if _attempt(lin, el, mem, mot, work):
+            for attempt in range(2):
+                if not _attempt(lin, el, mem, mot, work):
+                    break
                 for n in range(len(mot.doubt)):
-                    if mot.doubt[n] > 0.0:
-                        mot.g[:, n] = mot.new[:, n]
-                if _attempt(lin, el, mem, mot, work):
-                    for n in range(len(mot.doubt)):
-                        if mot.doubt[n] > 0.0:
-                            mot.new[:, n] = mot.g[:, n]
-                            _newton(lin, el, mem, mot, n, q0, v0, mot.new)
+                    if mot.doubt[n] > 0.0 and attempt == 0:
+                        for r in range(size):
+                            mot.g[r, n] = mot.new[r, n]
+                    elif mot.doubt[n] > 0.0:
+                        for r in range(size):
+                            mot.new[r, n] = mot.g[r, n]
+                        _newton(lin, el, mem, mot, n, q0, v0, mot.new)
             _copy(mot.new, mot.g)
             if mem.present:
                 _moved(lin.shared, lin.sq, lin.square_q, q0, mot.g, q)
@@ -370,3 +369,10 @@ def advance(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarra
         if (i + 1) % every == 0:
             _store(lin, mot, rows, i // every, outs, mot.acceleration)
     return last
+
+
+def ready() -> bool:
+    """Whether the loop was compiled before, in this process or on disk for these very sources and this Python."""
+    kept = advance.stats.cache_path
+    tag = f"py{sys.version_info.major}{sys.version_info.minor}."
+    return bool(advance.signatures) or (kept is not None and any(tag in path.name for path in Path(kept).glob("*.advance-*.nbc")))

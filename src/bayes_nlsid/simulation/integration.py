@@ -185,14 +185,15 @@ def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, 
     start = ((2 * zeta * omega).T, (omega**2).T, request.u0, request.v0, None if first is None else first[0])
     if wanted and compiled_wanted() and not joints.jumping:
         from bayes_nlsid.forces.compiled import law_code
+        from bayes_nlsid.simulation.compiled_loop import ready
         from bayes_nlsid.simulation.lanes import CompiledStepper
 
         # sliders and Bouc-Wen loops have a walk of their own and need no law
         codes = [law_code(entry.term) if entry.term.memory in ("none", "masing") else (0, 0.0) for entry in joints.entries]
         known = [code for code in codes if code is not None]
         if len(known) == len(codes):
-            if progress is not None:
-                progress("compiled time loop: the first run on a computer compiles it, which can take a minute")
+            if progress is not None and not ready():
+                progress("compiling the time loop, once on this computer: about half a minute")
             return CompiledStepper(coefficients, joints, known, *start), True
     with np.errstate(over="ignore", invalid="ignore"):
         return NumpyStepper(coefficients, joints, *start), False

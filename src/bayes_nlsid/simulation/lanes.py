@@ -117,6 +117,15 @@ class Block:
         self.which, self.count = which, count
         self.work = np.zeros((10, len(linear.b), len(which)))
 
+    def begin(self, q: Array, v: Array) -> None:
+        """Load every history from rest to q along a straight path; ``motion.g`` becomes the force at q, v (R, lanes)."""
+        from bayes_nlsid.simulation.compiled import commit, evaluate
+
+        still, mot = np.zeros_like(v), self.motion
+        for i in range(1, PRELOAD_STEPS + 1):
+            commit(self.elements, self.memory, q * (i / PRELOAD_STEPS), v if i == PRELOAD_STEPS else still, mot.scratch[4])
+        evaluate(self.elements, self.memory, q, v, mot.g, self.work[0], self.work[1], mot.scratch)
+
     def advance(self, count: int, force: Array, rows: Array, every: int, outs: tuple[Array, Array, Array]) -> None:
         """Run ``count`` steps; see ``compiled_loop.advance``."""
         from bayes_nlsid.simulation import compiled_loop as compiled
@@ -221,8 +230,6 @@ class CompiledStepper:
 
     def __init__(self, steps: Steps, joints: Joints, codes: list[tuple[int, float]], damping: Array, stiffness: Array, u: Array, v: Array,
                  p: Array | None) -> None:
-        from bayes_nlsid.simulation import compiled_loop as compiled
-
         self.samples = joints.samples
         self._blocks: list[Block] = []
         m, b = len(u), joints.shapes
@@ -232,7 +239,7 @@ class CompiledStepper:
                           _memory(joints, steps.step, which), _motion(steps.components, m, len(b), len(which)), which, count)
             mot, uw, vw = block.motion, np.ascontiguousarray(u[:, which]), np.ascontiguousarray(v[:, which])
             q, w = b @ uw, b @ vw
-            compiled.begin(block.linear, block.elements, block.memory, q, w, PRELOAD_STEPS, mot.g)
+            block.begin(q, w)
             mot.old[:], mot.before[:] = mot.g, mot.g
             mot.f[:] = modal[:, which] - b.T @ mot.g
             mot.x[:] = np.stack([uw, vw, mot.f - block.linear.damping * vw - block.linear.stiffness * uw])[:steps.components]
