@@ -113,8 +113,10 @@ def gather(spectra: Spectra, band: tuple[float, float], mains: float = 0.0) -> E
     variance_H = (variance + 0.1 * distortion)[excited] / safe[excited, None]
     hum = np.zeros(len(frequency), dtype=bool)
     if mains > 0 and spectra.kind == "steady":
-        hum = (np.abs(frequency / mains - np.round(frequency / mains)) * mains < 0.6 * spectra.rate / spectra.block) & ~excited
-    return Evidence(spectra, trust, np.where(hum[:, None], 1e-9, 1.0) / total, residual, H[excited], variance_H, statistic, odd, even, by_record)
+        away = np.abs(frequency / mains - np.round(frequency / mains)) * mains
+        hum = (away < 0.6 * spectra.rate / spectra.block) & ~excited
+    weight = np.where(hum[:, None], 1e-9, 1.0) / total
+    return Evidence(spectra, trust, weight, residual, H[excited], variance_H, statistic, odd, even, by_record)
 
 
 def quiet_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:

@@ -61,9 +61,16 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     top_linear = linear[0].gain if linear else 0.0
     short = _short_forces(forces, top_linear)
     if top_linear > 0.15 * top_force:
-        short += _short_linear(bench, linear, band, fit)
+        short += _short_linear(linear)
     say(f"estimating {len(short)} rivals jointly")
     singles = sorted((estimate(bench, begin if c.effect.is_force else fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    asked = top_linear > max(40.0, 0.15 * top_force)
+    if asked and (not singles or singles[0].fit.cost + singles[0].misfit_records > 1.02 * (fit.dof + bench.evidence.values) or
+                  singles[0].fit.cost > 1.02 * fit.dof):
+        # a stiff relaxing branch has a column that is a poor guide: try one at every joint, if nothing simpler explains the data
+        centre = 1.5 * float(np.sqrt(band[0] * band[1]))
+        slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
+        singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
     if quiet is not None:
         # the leaders also from the other calibration: a law that was strong has bent one of the two
         other = fit if begin is quiet else quiet
@@ -106,20 +113,12 @@ def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> l
     return out[:most]
 
 
-def _short_linear(bench: Bench, candidates: list[Candidate], band: tuple[float, float], fit: LinearFit, most: int = 7) -> list[Candidate]:
-    """The best linear effects, and a relaxing branch at every joint, whose column is a poor guide when the branch is stiff."""
+def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]:
+    """The best linear effects by their columns (relaxing branches apart)."""
     if not candidates or candidates[0].gain < WORTH:
         return []
-    top = candidates[0].gain
-    limit = max(WORTH, 0.15 * top)
-    out = [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
-    centre = float(np.sqrt(band[0] * band[1]))
-    if top > 40:
-        slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, 1.5 * centre) for place in bench.family.places]
-        leftover = fit.cost - fit.dof
-        # where one branch explains nothing, its relatives need not be asked with more effort
-        out += slow if leftover > 40 else []
-    return out
+    limit = max(WORTH, 0.15 * candidates[0].gain)
+    return [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
 
 
 def _better(first: list[Hypothesis], second: list[Hypothesis]) -> list[Hypothesis]:
