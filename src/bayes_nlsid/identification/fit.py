@@ -14,6 +14,7 @@ from bayes_nlsid.identification.descent import Descent, Point
 from bayes_nlsid.identification.elimination import jacobian
 from bayes_nlsid.identification.problem import Problem
 
+TABLE_TOLERANCE = 0.01   # share of the mean square that a force table may change before it is mentioned
 SCREENING, SURVIVORS = 7, 8    # iterations given to every start, starts that go on to convergence
 
 
@@ -183,6 +184,11 @@ def _result(problem: Problem, weights: NDArray[np.float64], tried: tuple[Start, 
     reasons = []
     if rank < size:
         reasons.append(f"the recordings inform {rank} of {size} directions; the others keep the width of their bounds")
+    if problem.places:
+        exact = replace(problem, places=0).mse(best.theta, weights)
+        if abs(exact - best.mse) > TABLE_TOLERANCE * exact:
+            reasons.append(f"interpolating the force laws between {problem.places} displacements changes the mean square from {exact:.3g} "
+                           f"to {best.mse:.3g}")
     if piled := problem.piled(best.theta):
         reasons.append(f"at a bound: {', '.join(piled)}")
     status = "ok" if best.status == "converged" else best.status if best.status == "iteration limit" else "iteration limit"

@@ -12,6 +12,7 @@ from bayes_nlsid.forces.motion import Motion, force_along, motion
 from bayes_nlsid.forces.term import Term
 from bayes_nlsid.identification.scenario import Scenario
 from bayes_nlsid.identification.spectrum import Spectrum
+from bayes_nlsid.identification.table import ForceTable, build, symmetry_of
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 
 BLOCK = 2_000_000  # samples of force held at once, about 16 MB per array
@@ -68,6 +69,7 @@ class Observed:
     record: NDArray[np.intp] = field(init=False, repr=False)
     linear_force: NDArray[np.float64] = field(init=False, repr=False)
     _motions: dict[tuple[int, str, bool], Motion] = field(init=False, repr=False, default_factory=dict)
+    _tables: dict[tuple[str, str, str, int], ForceTable] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.data:
@@ -169,8 +171,22 @@ class Observed:
         force = force_along(term, path, p, excess)
         return force[..., part] if memory else force
 
-    def force(self, term: Term, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:
-        """In-band contribution (..., N) of one location to the residual, b_l f(q_l, v_l; p), for p (..., n_p)."""
+    def force(self, term: Term, location: str, p: ArrayLike, excess: bool, places: int = 0) -> NDArray[np.float64]:
+        """In-band contribution (..., N) of one location to the residual, b_l f(q_l, v_l; p), for p (..., n_p).
+
+        With ``places`` the law is interpolated between so many displacements where it allows that (see ``table``); 0 is exact.
+        """
+        kind = symmetry_of(term, 1.0) if places else None
+        if kind is None:
+            return self._exact_force(term, location, p, excess)
+        key = (location, term.memory, kind, places)
+        if key not in self._tables:
+            # Memory runs through all samples, also those that are not fitted.
+            reach = max(float(np.max(np.abs(self.path(r, location)[0]))) for r in range(len(self.data)))
+            self._tables[key] = build(lambda t, x: self._exact_force(t, location, x, False), term.memory, kind, reach, places)
+        return self._tables[key].force(term, p, excess)
+
+    def _exact_force(self, term: Term, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:
         values = np.asarray(p, dtype=float)
         rows = values.reshape(-1, values.shape[-1])
         out = np.zeros((len(rows), self.size))

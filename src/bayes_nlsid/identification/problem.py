@@ -58,6 +58,8 @@ class Problem:
         Symlog constant of signed parameters (Eq. 14), in their own SI unit. Positive parameters use log10.
     taper : float
         Fraction of a transient under cosine edges; steady periods are never tapered.
+    places : int
+        Displacements between which force laws are interpolated (see ``table``), 0 for none: then every evaluation walks through all samples.
     observed : Observed or None
         Prepared recordings to share between problems that differ in their elements only.
 
@@ -83,6 +85,7 @@ class Problem:
     linear_widening: tuple[float, float] = (1.0, 1.0)
     c: float = 1.0
     taper: float = 0.1
+    places: int = 0
     observed: Observed = field(default=None, repr=False)  # type: ignore[assignment]
     bounds: NDArray[np.float64] = field(init=False, repr=False)
     coordinates: Coordinates = field(init=False, repr=False)
@@ -115,6 +118,10 @@ class Problem:
         free = np.isin(seen.equation, self.model.free_modes)
         base = seen.inertia + np.where(free, 0.0, 2 * zeta * omega * seen.velocity + omega**2 * seen.displacement)
         columns, index, pieces = [], [], []
+        if self.model.free_gain:   # the recorded force moves from the constant part to a column of its own
+            base = base + (force := self._force())
+            columns.append(-force)
+            index.append(2 * len(self.model.free_modes))
         for e, element in enumerate(self.model.elements):
             known = dict(element.fixed)
             fixed = np.array([known.get(p.name, np.nan) for p in element.term.params])
@@ -136,9 +143,25 @@ class Problem:
         object.__setattr__(self, "linear_index", tuple(index))
         object.__setattr__(self, "pieces", tuple(pieces))
 
+    def _force(self) -> NDArray[np.float64]:
+        """In-band modal force (N,) as recorded.
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        seen, out = self.observed, np.zeros(self.observed.size)
+        for cell in seen.cells:
+            entry, spectrum = self.data[cell.record], seen.spectra[cell.record]
+            out[cell.entries] = spectrum.apply(entry.force[spectrum.samples, entry.modes.index(cell.equation)])
+        if not np.any(out):
+            raise ValueError("free_gain: no recording holds a force, so its gain is not a parameter; use free_gain=False")
+        return out
+
     def _piece_force(self, piece: Piece, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         values = piece.values(theta)
-        return sum((self.observed.force(piece.element.term, name, values, piece.element.excess) for name in piece.locations),
+        return sum((self.observed.force(piece.element.term, name, values, piece.element.excess, self.places) for name in piece.locations),
                    np.zeros((*theta.shape[:-1], self.observed.size)))
 
     # -- the residual ------------------------------------------------------------------------------------------------------------

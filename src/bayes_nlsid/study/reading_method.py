@@ -112,13 +112,16 @@ def read_identification(table: Table | None, locations: Sequence[str], terms: Se
     widening = table.number("widening", default=1.0)
     if widening < 1:
         raise table.wrong("widening", f"{widening:g} is below 1", "write 1 for the paper's bounds or more to widen them")
+    if 0 < table.integer("places", 192, low=0) < 8:
+        raise table.wrong("places", "is too small for a table of forces", "write 0 for none, or some 100 to 400")
     entry = IdentificationEntry(
         table.text("scenario", "S2", SCENARIOS), main, modes, free, table.span("band", "frequency", None), joints, candidates, elements,
         alternatives, tied, excess, widening, table.number("eps1", default=None, positive=True),
         table.number("eps2", default=None, positive=True), table.integer("starts", 50, low=1),
         table.number("rate", "frequency", None, positive=True), _spans(table, "mode_bands", len(modes)),
         table.flag("static_correction", False), table.number("settle", "time", 0.0), table.integer("most", 6, low=1),
-        table.flag("output_error", False))
+        table.number("frequency_widening", default=1.0, positive=True), table.number("damping_widening", default=1.0, positive=True),
+        table.integer("places", 192, low=0), table.flag("output_error", False), table.flag("free_gain", False))
     table.close()
     return entry
 
@@ -222,7 +225,8 @@ def read_prediction(table: Table | None, locations: Sequence[str], recordings: S
         at, table.number("amplitude", "length", positive=True), table.integer("mode", 1, low=1), table.integer("samples", 100, low=2),
         table.number("seconds", "time", None, positive=True), table.number("fs", "frequency", None, positive=True),
         table.text("scheme", "hht", ("hht", "exponential")), table.numbers("amplitudes", "length", ()), table.text("measured", None),
-        table.span("band", "frequency", None), heldout, table.integer("draws", 100, low=2))
+        table.span("band", "frequency", None), heldout, table.integer("draws", 100, low=2),
+        table.text("score", "band", ("band", "all")))
     table.close()
     return entry
 

@@ -85,9 +85,11 @@ class IdentificationEntry:
 
     ``modes``, ``main`` and ``free_modes`` are 1-based. ``candidates`` are names of terms with groups already spelled out; empty means
     that the form is known (``elements``). ``band`` (Hz) bounds the residual, ``rate`` (Hz) lowers the sampling, ``mode_bands`` gives
-    each mode a filter of its own. ``most`` is the largest number of terms that a selection may keep. ``settle`` (s) is the start of every
+    each mode a filter of its own. ``frequency_widening`` and ``damping_widening``
+    multiply the ±5 % and ±20 % of the linear bounds. ``places`` is the number of displacements between which force laws are interpolated
+    while searching, 0 for none. ``most`` is the largest number of terms that a selection may keep. ``settle`` (s) is the start of every
     training record that enters the memory of the joints but not the residual. ``output_error`` refines the regression by least squares
-    on the simulated response.
+    on the simulated response. ``free_gain`` estimates one factor on all recorded forces along.
     """
 
     scenario: str = "S2"
@@ -110,7 +112,11 @@ class IdentificationEntry:
     static_correction: bool = False
     settle: float = 0.0
     most: int = 6
+    frequency_widening: float = 1.0
+    damping_widening: float = 1.0
+    places: int = 192
     output_error: bool = False
+    free_gain: bool = False
 
 
 @final
@@ -164,7 +170,8 @@ class PredictionEntry:
     """``[prediction]``: the backbone (release from a mode shape, zero crossings) and records kept for judging.
 
     ``at`` names the location whose amplitude is meant, ``amplitude`` (m) where the release starts, ``mode`` is 1-based, ``seconds``
-    the length of the decay, ``samples`` the number of posterior draws.
+    the length of the decay, ``samples`` the number of posterior draws. ``score`` says where records kept for judging are compared:
+    ``"band"``, that of the identification, or ``"all"`` frequencies, zero included.
     """
 
     at: str
@@ -179,6 +186,7 @@ class PredictionEntry:
     band: tuple[float, float] | None = None
     heldout: tuple[str, ...] = ()
     draws: int = 100
+    score: Literal["band", "all"] = "band"
 
 
 @final

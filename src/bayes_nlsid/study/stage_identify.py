@@ -92,8 +92,9 @@ def _all_elements(entry: IdentificationEntry) -> list[Any]:
 def base_problem(context: Context, elements: Sequence[Element] = (), data: tuple[ModalData, ...] | None = None) -> Problem:
     """The regression problem of the study with the given elements."""
     entry = entry_of(context)
-    model = Model(context.model, tuple(elements), tuple(k - 1 for k in entry.free_modes))
-    return Problem(model, data if data is not None else observed(context), chosen_scenario(context), entry.band, entry.widening)
+    model = Model(context.model, tuple(elements), tuple(k - 1 for k in entry.free_modes), entry.free_gain)
+    return Problem(model, data if data is not None else observed(context), chosen_scenario(context), entry.band, entry.widening,
+                   (entry.frequency_widening, entry.damping_widening), places=entry.places)
 
 
 def identify(context: Context) -> Result:
@@ -207,5 +208,5 @@ def stored_model(context: Context, variant: int = 0) -> tuple[Model, np.ndarray]
     saved = context.done["identify"]
     record = saved.data["variants"][variant]
     model = Model(context.model, tuple(element_from(e, context.terms) for e in record["elements"]),
-                  tuple(k - 1 for k in entry_of(context).free_modes))
+                  tuple(k - 1 for k in entry_of(context).free_modes), entry_of(context).free_gain)
     return replace(model), np.asarray(saved.arrays[f"{variant}.theta"], dtype=float)

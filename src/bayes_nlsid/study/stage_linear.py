@@ -42,6 +42,10 @@ def linear(context: Context) -> Result:
     recording = _low_level(context)
     measured = identify_modes(recording, nominal, modes=wanted)
     signs = [{"channel": f.channel, "sentence": f.sentence} for f in polarity(measured, nominal)]
+    missing = [f"mode {k + 1}, {nominal.frequency[k]:.4g} Hz in the model, was not found in recording {recording.name!r}: it was not "
+               "excited, or the model is more than 10 % off" for k in wanted if k not in measured.nominal]
+    for sentence in missing:
+        context.note(sentence)
     for sign in signs:
         context.note(sign["sentence"])
     final, updated, notes = _updated(context, structure, measured)
@@ -54,7 +58,7 @@ def linear(context: Context) -> Result:
     if study.structure.kind == "beam" and table:
         arrays |= _shape_lines(context, updated, [row["number"] - 1 for row in table])
     return arrays, {"model": names, "modes": table, "polarity": signs, "updated": updated, "shape_locations": list(measured.locations),
-                    "notes": [*model.notes, *measured.notes, *notes], "recording": recording.name}
+                    "notes": [*model.notes, *measured.notes, *missing, *notes], "recording": recording.name}
 
 
 def _updated(context: Context, structure: Structure | ModalModel, measured: Any) -> tuple[Any, list[dict[str, Any]], list[str]]:
