@@ -60,11 +60,15 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
     short = _short_forces(forces, top_linear)
-    if top_linear > 0.15 * top_force:
-        short += _short_linear(linear)
-    say(f"estimating {len(short)} rivals jointly")
-    singles = sorted((estimate(bench, begin if c.effect.is_force else fit, (c,), rounds=3) for c in short), key=lambda h: h.cost)
-    asked = top_linear > max(40.0, 0.15 * top_force)
+    say(f"estimating {len(short)} laws jointly")
+    singles = sorted((estimate(bench, begin, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    # a law that explains columns than any linear effect could makes those superfluous as first effects
+    linear_too = top_linear > 0.15 * top_force and (not singles or 1.5 * top_linear > none - singles[0].cost)
+    if linear_too:
+        columns = _short_linear(linear)
+        say(f"estimating {len(columns)} linear effects")
+        singles = _better(singles, [estimate(bench, fit, (c,)) for c in columns])
+    asked = linear_too and top_linear > 40
     if asked and (not singles or singles[0].fit.cost + singles[0].misfit_records > 1.02 * (fit.dof + bench.evidence.values) or
                   singles[0].fit.cost > 1.02 * fit.dof):
         # a stiff relaxing branch has a column that is a poor guide: try one at every joint, if nothing simpler explains the data
@@ -74,7 +78,7 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     if quiet is not None:
         # the leaders also from the other calibration: a law that was strong has bent one of the two
         other = fit if begin is quiet else quiet
-        again = [estimate(bench, other, (c,), rounds=3) for c in [c for c in short if c.effect.is_force][:2]]
+        again = [estimate(bench, other, (c,), rounds=3) for c in short[:2]]
         singles = _better(singles, again)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
