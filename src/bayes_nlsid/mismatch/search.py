@@ -62,7 +62,7 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     short = _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
     singles = sorted((estimate(bench, begin, (c,), rounds=3) for c in short), key=lambda h: h.cost)
-    # a law that explains columns than any linear effect could makes those superfluous as first effects
+    # a law that explains more than any linear effect could makes those superfluous as first effects
     linear_too = top_linear > 0.15 * top_force and (not singles or 1.5 * top_linear > none - singles[0].cost)
     if linear_too:
         columns = _short_linear(linear)
