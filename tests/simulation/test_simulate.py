@@ -60,20 +60,20 @@ def test_second_order_against_an_independent_integrator(scheme: str, least: floa
     assert errors[-1] < 2e-4
 
 
-@pytest.mark.parametrize("scheme", ["hht", "exponential"])
-def test_several_modes_and_joints_against_an_independent_integrator(scheme: str) -> None:
+def test_several_modes_and_joints_against_an_independent_integrator() -> None:
     model = beam("iwan4", "v|v|")
     theta = np.concatenate([IWAN, [2e3, 1e3]])
     u0 = np.array([4e-3, 0.0, 0.0])
-    exact = reference(model, theta, u0, 0.25, lambda t: 30.0 * np.sin(40 * np.pi * t))
-    errors = []
-    for fs in (4000, 8000):
-        n = fs // 4 + 1
-        force = 30.0 * np.sin(40 * np.pi * np.arange(n) / fs)[:, None]
-        response = simulate(model, [theta], fs=fs, samples=n, u0=u0, force=force, scheme=scheme, keep=("tip",))  # type: ignore[arg-type]
-        errors.append(np.abs(response.final_displacement[0] - exact).max())
-    assert errors[1] < errors[0] / 3.5
-    assert errors[1] < 8e-3 * np.abs(exact).max()
+    exact = reference(model, theta, u0, 0.125, lambda t: 30.0 * np.sin(40 * np.pi * t))
+    for scheme in ("hht", "exponential"):
+        errors = []
+        for fs in (4000, 8000):
+            n = fs // 8 + 1
+            force = 30.0 * np.sin(40 * np.pi * np.arange(n) / fs)[:, None]
+            response = simulate(model, [theta], fs=fs, samples=n, u0=u0, force=force, scheme=scheme, keep=("tip",))  # type: ignore[arg-type]
+            errors.append(np.abs(response.final_displacement[0] - exact).max())
+        assert errors[1] < errors[0] / 3.5
+        assert errors[1] < 8e-3 * np.abs(exact).max()
 
 
 @pytest.mark.parametrize("scheme", ["hht", "exponential"])
@@ -120,7 +120,7 @@ def test_undamped_duffing_follows_the_elliptic_function_and_keeps_its_energy() -
     w2 = W**2 + c * a**2
     m = c * a**2 / (2 * w2)
     fs = 20000
-    response = simulate(model, [[c]], fs=fs, samples=fs // 2 + 1, u0=[a], scheme="exponential")
+    response = simulate(model, [[c]], fs=fs, samples=fs // 4 + 1, u0=[a], scheme="exponential")
     exact = a * ellipj(np.sqrt(w2) * response.time, m)[1]
     assert np.abs(response.displacement[0, :, 0] - exact).max() < 2e-4 * a
     u, v = response.displacement[0, :, 0], response.velocity[0, :, 0]
@@ -147,7 +147,7 @@ def test_a_batch_is_its_samples_one_by_one(terms: tuple[str, ...], free: tuple[i
     values = {"iwan4": IWAN, "iwan4_memory": IWAN, "clearance": np.tile([2e6, 4e-5], 2), "cubic": np.array([1e13, 2e13]),
               "coulomb": np.array([10.0, 5.0])}
     theta = scattered(model.start(np.concatenate([values[t] for t in terms])), 3)
-    kwargs = {"fs": 4096.0, "samples": 150, "u0": np.array([5e-3, 0.0, 0.0]), "keep": ("tip", "J1")}
+    kwargs = {"fs": 4096.0, "samples": 80, "u0": np.array([5e-3, 0.0, 0.0]), "keep": ("tip", "J1")}
     batch = simulate(model, theta, **kwargs)  # type: ignore[arg-type]
     for i in range(3):
         one = simulate(model, theta[i], **kwargs)  # type: ignore[arg-type]
@@ -159,7 +159,7 @@ def test_a_batch_is_its_samples_one_by_one(terms: tuple[str, ...], free: tuple[i
 def test_accelerations_satisfy_the_equation_of_motion(scheme: str) -> None:
     model = beam("iwan4_memory", "v|v|")
     theta = np.concatenate([IWAN, [2e3, 1e3]])
-    n, fs = 600, 4096.0
+    n, fs = 200, 4096.0
     force = 20 * np.random.default_rng(1).standard_normal((n, 1))
     lin = model.linear
     # keep as many locations as modes, so that modal motion can be taken back out of the response
@@ -193,7 +193,7 @@ def test_divergence_is_a_status_and_leaves_the_others_alone() -> None:
 def test_stiff_contact_converges_and_keeps_its_energy(stiffness: float) -> None:
     model = oscillator("clearance", zeta=0.0)
     fs = 50000
-    response = simulate(model, [[stiffness, 0.1]], fs=fs, samples=fs // 4, u0=[0.049], v0=[2.0], scheme="exponential")
+    response = simulate(model, [[stiffness, 0.1]], fs=fs, samples=fs // 8, u0=[0.049], v0=[2.0], scheme="exponential")
     assert response.status[0] == "ok"
     u, v = response.displacement[0, :, 0], response.velocity[0, :, 0]
     inside = np.abs(u) < 0.05
@@ -206,12 +206,12 @@ def test_a_growing_history_costs_no_accuracy() -> None:
     # every half cycle of a decay nests inside the last: the stack of reversals grows by one each time
     model = oscillator("iwan4_memory", zeta=0.002)
     p = [40.0, 2000.0, -0.4, 0.2]
-    fs = 1000
+    fs = 500
     response = simulate(model, [p], fs=fs, samples=4 * fs + 1, u0=[0.02], scheme="exponential")
     u, v = response.displacement[0, :, 0], response.velocity[0, :, 0]
     assert np.count_nonzero(np.diff(np.sign(v)) != 0) > 60
     # at the end motion is so small that the joint is stuck: linear frequency again
-    late = u[-1000:]
+    late = u[-500:]
     up = np.flatnonzero((late[:-1] < 0) & (late[1:] >= 0))
     crossing = (up - late[up] / (late[up + 1] - late[up])) / fs
     assert 1 / np.diff(crossing).mean() == pytest.approx(10.0, rel=2e-2)
@@ -220,9 +220,9 @@ def test_a_growing_history_costs_no_accuracy() -> None:
 
 def test_steady_forced_motion_is_the_frequency_response() -> None:
     model = beam(free=(0,))
-    theta = model.start() * np.array([[1.0, 1.0], [1.02, 1.5]])
+    theta = model.start() * np.array([[1.0, 5.0], [1.02, 7.5]])   # damped enough to be steady after five seconds
     fs, f = 4096.0, 19.0
-    n = int(fs * 20)
+    n = int(fs * 6)
     force = np.cos(2 * np.pi * f * np.arange(n) / fs)[:, None]
     response = simulate(model, theta, fs=fs, samples=n, force=force, scheme="exponential", keep=("tip",), store=("displacement",))
     tail = response.displacement[:, -4096:, 0]
