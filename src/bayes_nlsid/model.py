@@ -88,6 +88,9 @@ class Model:
     elements : tuple of Element
     free_modes : tuple of int
         Modes whose frequency and damping are parameters; all others keep the values of ``linear``.
+    free_gain : bool
+        One factor on all recorded forces is a parameter, ``gain``: for a force cell, an amplifier or a modal mass that is known roughly.
+        The equations of motion are then driven by gain · φᵀF.
 
     Raises
     ------
@@ -98,6 +101,7 @@ class Model:
     linear: ModalModel
     elements: tuple[Element, ...] = ()
     free_modes: tuple[int, ...] = ()
+    free_gain: bool = False
 
     def __post_init__(self) -> None:
         seen: set[tuple[str, str]] = set()
@@ -112,9 +116,10 @@ class Model:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Every entry of theta in order: frequencies (Hz), damping ratios, then the elements group by group."""
+        """Every entry of theta in order: frequencies (Hz), damping ratios, the gain of the force, then the elements group by group."""
         out = [Parameter(f"f[{k + 1}]", "Hz", mode=k) for k in self.free_modes]
         out += [Parameter(f"zeta[{k + 1}]", "", mode=k) for k in self.free_modes]
+        out += [Parameter("gain", "")] if self.free_gain else []
         for i, element in enumerate(self.elements):
             for g, group in enumerate(element.groups):
                 place = "+".join(group)
@@ -141,6 +146,10 @@ class Model:
         zeta[..., list(self.free_modes)] = values[..., count:2 * count]
         return omega, zeta
 
+    def gain(self, theta: ArrayLike) -> NDArray[np.float64] | None:
+        """Factor (...) on recorded forces; None where it is not a parameter."""
+        return self._checked(theta)[..., 2 * len(self.free_modes)] if self.free_gain else None
+
     def element_values(self, theta: ArrayLike, element: int, location: str) -> NDArray[np.float64]:
         """All parameters (..., n_p) of one element at one of its locations, fixed ones included, SI."""
         values = self._checked(theta)
@@ -162,9 +171,10 @@ class Model:
             If the number of nonlinear values is wrong.
         """
         modes = list(self.free_modes)
-        theta = np.concatenate([self.linear.frequency[modes], self.linear.zeta[modes], np.asarray(nonlinear, dtype=float)])
+        linear = [self.linear.frequency[modes], self.linear.zeta[modes], np.ones(int(self.free_gain))]
+        theta = np.concatenate([*linear, np.asarray(nonlinear, dtype=float)])
         if theta.shape != (self.size,):
-            raise ValueError(f"{len(nonlinear)} nonlinear values given, the model has {self.size - 2 * len(modes)}")
+            raise ValueError(f"{len(nonlinear)} nonlinear values given, the model has {self.size - sum(map(len, linear))}")
         return theta
 
     def _checked(self, theta: ArrayLike) -> NDArray[np.float64]:

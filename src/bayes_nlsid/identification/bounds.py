@@ -12,6 +12,7 @@ from bayes_nlsid.identification.observed import Observed
 from bayes_nlsid.model import Element, Model
 
 FREQUENCY, DAMPING = 0.05, 0.20   # half widths of Section 2.2
+GAIN = 1.5                        # an unknown gain of the force lies within this factor of 1
 LEVERAGE_FLOOR = 0.1              # of the largest leverage among the locations of an element
 MOTION_FLOOR = 0.01               # of the largest motion among them
 
@@ -19,7 +20,8 @@ MOTION_FLOOR = 0.01               # of the largest motion among them
 def bounds(model: Model, observed: Observed, widening: float, linear_widening: tuple[float, float]) -> NDArray[np.float64]:
     """Bounds (P, 2) of theta.
 
-    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``. The largest force at a location
+    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``; a gain of the force between 1/1.5
+    and 1.5. The largest force at a location
     is the one whose modal force equals the linear modal forces (inertia + damping + stiffness, each at its largest), over the fitted
     equations in the root-sum-square sense: F_l = ‖L‖ / ‖b_l‖. For one equation this is the paper's rule. A location that hardly
     moves or hardly acts on the fitted equations (the middle joint in mode 1) would get an infinite bound: its leverage and motion
@@ -48,7 +50,9 @@ def bounds(model: Model, observed: Observed, widening: float, linear_widening: t
     out = np.empty((model.size, 2))
     sides = np.array([-1.0, 1.0])
     for i, parameter in enumerate(model.parameters):
-        if parameter.element < 0:
+        if parameter.name == "gain":
+            out[i] = 1 / GAIN, GAIN
+        elif parameter.element < 0:
             damping = parameter.name.startswith("zeta")
             nominal = (model.linear.zeta if damping else model.linear.frequency)[parameter.mode]
             half = DAMPING * linear_widening[1] if damping else FREQUENCY * linear_widening[0]

@@ -151,7 +151,7 @@ def default_priors(problem: Problem) -> tuple[Prior, ...]:
     """A prior for every entry of theta.
 
     Frequencies and damping ratios: normal around the modal test with its own standard deviation (``omega_sd``, ``zeta_sd``), or half the
-    bound where none is stated. Signed coefficients: normal around 0 with a tenth of the bound, i.e. a force of a tenth of the whole
+    bound where none is stated. The gain of the force: log-uniform. Signed coefficients: normal around 0 with a tenth of the bound, i.e. a force of a tenth of the whole
     linear force; the bound alone, a force as large as everything linear, is far too generous. Stiffnesses, forces, displacements and
     velocities: log-uniform over the bounds. Ranges: uniform if they include 0 or span less than two decades, else log-uniform.
     """
@@ -159,7 +159,9 @@ def default_priors(problem: Problem) -> tuple[Prior, ...]:
     out = []
     for parameter, (low, high) in zip(problem.model.parameters, problem.bounds.tolist(), strict=True):
         name, unit = parameter.name, parameter.unit
-        if parameter.param is None:
+        if name == "gain":
+            out.append(Prior(name, unit, "loguniform", low, high))
+        elif parameter.param is None:
             damping = name.startswith("zeta")
             nominal = float((linear.zeta if damping else linear.frequency)[parameter.mode])
             relative = float((linear.zeta_sd if damping else linear.omega_sd)[parameter.mode])

@@ -38,6 +38,8 @@ class ChannelSpec:
     polarity : {1, -1}
     per_volt : float, optional
         For a unit of voltage: SI units of the quantity for one volt; 1.0 declares that the volt itself stands in for them.
+    offset : float
+        What the channel reads at rest, in the unit of the file; taken from every sample.
 
     Raises
     ------
@@ -53,6 +55,7 @@ class ChannelSpec:
     column: int | None = None
     polarity: int = 1
     per_volt: float | None = None
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -66,6 +69,8 @@ class ChannelSpec:
             raise InputError(where, f"column is {self.column!r}", "count columns from 0")
         if self.per_volt is not None and not (_is_number(self.per_volt) and self.per_volt != 0):
             raise InputError(where, f"per_volt is {self.per_volt!r}", "give a finite sensitivity other than zero")
+        if not _is_number(self.offset):
+            raise InputError(where, f"offset is {self.offset!r}", "give a finite number in the unit of the file")
 
 
 @final
@@ -331,7 +336,7 @@ def _samples(contents: Contents, spec: ChannelSpec, values: NDArray[np.float64],
                 if good[1] - good[0] > 1 else "drop the channel")
         raise InputError(place, f"{bad.size} samples are missing or infinite, the first is sample {part.start + bad[0]} "
                          f"(t = {(part.start + bad[0]) * dt:g} s)", mend)
-    return np.asarray(spec.polarity * factor * taken, dtype=float)
+    return np.asarray(spec.polarity * factor * (taken - spec.offset), dtype=float)
 
 
 def _is_voltage(unit: str) -> bool:

@@ -138,9 +138,12 @@ class _Request:
         if self.force is None:
             return None
         shapes = self.model.linear.rows(self.model.linear.inputs)
+        gain = self.model.gain(self.theta)
         if self.force.ndim == 2:
-            return self.force[start:stop] @ shapes
-        return np.ascontiguousarray(np.moveaxis(self.force[:, start:stop] @ shapes, 0, -1))
+            modal = self.force[start:stop] @ shapes
+            return modal if gain is None else modal[..., None] * gain
+        modal = np.ascontiguousarray(np.moveaxis(self.force[:, start:stop] @ shapes, 0, -1))
+        return modal if gain is None else modal * gain
 
 
 def _request(model: Model, theta: ArrayLike, fs: float, samples: int, force: ArrayLike | None, u0: ArrayLike | None, v0: ArrayLike | None,
@@ -204,8 +207,9 @@ def _drive(request: _Request, stepper: Stepper, window: int, stop_amplitude: flo
     """Run block by block: store, watch for divergence, stop at the floor. Returns the three quantities (S, n, L) and the status (S,)."""
     rows, every = request.rows, request.every
     count, locations = request.theta.shape[0], len(request.keep)
-    per_step = 8 * max(1, count) * max(1,
-                                       request.model.linear.modes if request.force is not None and request.force.ndim == 3 else locations)
+    # a force of its own for every sample is held as modal forces
+    single = request.force is not None and (request.force.ndim == 3 or request.model.free_gain)
+    per_step = 8 * max(1, count) * max(1, request.model.linear.modes if single else locations)
     block = max(every, min(4096, BLOCK_BYTES // per_step) // every * every)
     if stop_amplitude is not None:
         block = max(block, window)

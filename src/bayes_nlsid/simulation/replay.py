@@ -38,7 +38,7 @@ class Replay:
     numerical_error : float
         Estimate of the integrator's error, rms over rms of the response, from halving the step on a stretch of the first sample.
     drift : ndarray (S,)
-        Periodic recordings: rms change over the last period over rms; else 0.
+        Periodic recordings: rms change from one period to the next over rms; else 0.
     final_displacement, final_velocity : ndarray (S, m)
         Modal state at the last instant.
 
@@ -194,28 +194,30 @@ def _steady(source: _Source, theta: Array, substeps: int) -> tuple[Array, NDArra
     period = int(recording.period or recording.n)
     one = source.force(substeps)
     omega, zeta = source.model.linear_values(theta)
-    memory = period * recording.dt * np.maximum((omega * zeta).min(axis=-1), 1e-12)
-    start = _linear_steady(source, theta)
-    # the linear steady state is close, so a start error of order one need only fall to the tolerance; at least two periods for the
-    # comparison
-    settle = int(np.clip(np.ceil(np.log(1 / SETTLED) / memory.min()), 2, MOST_PERIODS))
-    count = 2 * period
-    total = settle * period + count
-    force = None if one is None else one[np.arange((total - 1) * substeps + 1) % len(one)]
-    both, status, end = source.run(theta, substeps, force, start, settle * period, count)
-    last, before = both[:, period:], both[:, :period]
+    # the linear steady state is close, so a start error of order one need only fall to the tolerance; hysteresis forgets more slowly
+    # than its linear part, hence twice that time and a stretch of a period before the one that counts
+    forget = 2 * np.log(1 / SETTLED) / (recording.dt * max(float((omega * zeta).min()), 1e-12))
+    lead = int(min(MOST_PERIODS * period, np.ceil(forget)))
+    compared = min(lead, period)
+    first = -(lead + compared) % period
+    start = _linear_steady(source, theta, first)
+    count = compared + period
+    force = None if one is None else one[(first * substeps + np.arange((lead + count - 1) * substeps + 1)) % len(one)]
+    both, status, end = source.run(theta, substeps, force, start, lead, count)
+    last, before = both[:, compared:], both[:, :compared]
     size = np.sqrt(np.mean(np.square(last), axis=(1, 2)))
-    drift = np.sqrt(np.mean(np.square(last - before), axis=(1, 2))) / np.maximum(size, 1e-300)
+    drift = np.sqrt(np.mean(np.square(last[:, period - compared:] - before), axis=(1, 2))) / np.maximum(size, 1e-300)
     status = np.array(status, dtype="<U16")
     status[(status == "ok") & (drift > SETTLED)] = "not periodic"
     return np.tile(last, (1, recording.n // period, 1)), status, drift, end
 
 
-def _linear_steady(source: _Source, theta: Array) -> tuple[Array, Array]:
-    """Modal displacement and velocity (S, m) of the linear part in steady state at the start of a period."""
+def _linear_steady(source: _Source, theta: Array, at: int = 0) -> tuple[Array, Array]:
+    """Modal displacement and velocity (S, m) of the linear part in steady state at a sample of the period."""
     force = source.force(1)
     if force is None:
         raise ValueError("a steady state needs a force")
+    force = np.roll(force, -at, axis=0)
     lines = np.fft.rfft(force @ source.model.linear.rows(source.model.linear.inputs), axis=0)
     w = 2 * np.pi * np.fft.rfftfreq(len(force), source.recording.dt)[:, None]
     omega, zeta = source.model.linear_values(theta)
@@ -225,7 +227,9 @@ def _linear_steady(source: _Source, theta: Array) -> tuple[Array, Array]:
     weight[0] = 1.0
     if len(force) % 2 == 0:
         weight[-1] = 1.0
-    return (np.einsum("f,sfm->sm", weight, u.real) / len(force), np.einsum("f,sfm->sm", weight, (1j * w * u).real) / len(force))
+    gain = source.model.gain(theta)
+    scale = (np.ones(len(theta)) if gain is None else gain)[:, None] / len(force)
+    return scale * np.einsum("f,sfm->sm", weight, u.real), scale * np.einsum("f,sfm->sm", weight, (1j * w * u).real)
 
 
 def _finer_periodic(x: Array, factor: int) -> Array:

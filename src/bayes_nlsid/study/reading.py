@@ -169,12 +169,13 @@ def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
     polarity = table.integer("polarity", 1, low=-1, high=1)
     name = table.text("name", location if quantity != "force" else f"force at {location}")
     array, column = table.text("array"), table.integer("column", None)
+    offset = table.number("offset", default=0.0)
     if polarity == 0 or per_volt == 0:
         key = "polarity" if polarity == 0 else "per_volt"
         raise table.wrong(key, "is 0", "write 1, or -1 for a sensor mounted the other way round" if key == "polarity"
                           else "give the sensitivity")
     table.close()
-    return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt)
+    return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt, offset)
 
 
 def _read_update(table: Table) -> tuple[tuple[str, tuple[str, ...]], ...]:

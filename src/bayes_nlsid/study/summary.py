@@ -50,7 +50,7 @@ def _verdict(done: Mapping[str, Saved]) -> tuple[str, list[str]]:
     if "posterior" in done:
         data = done["posterior"].data
         reasons += data["reasons"]
-        linear = ("f[", "zeta[")
+        linear = ("f[", "zeta[", "gain")
         flags = [f for f, name in zip(data["identifiable"], data["names"], strict=True) if not name.startswith(linear)]
         if not data["convergence"]["converged"]:
             status = "not_converged"
