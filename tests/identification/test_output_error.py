@@ -80,3 +80,24 @@ def test_recordings_must_be_known():
         output_error(start, [replace(recording, name="other")])
     with pytest.raises(ValueError, match="none"):
         output_error(start, [])
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_an_unknown_gain_of_the_force_is_found(refine):
+    model, data, recording = sweep()
+    gain = 1.2
+    problem = Problem(Model(model, (Element(LIBRARY["cubic"], ("J1", "J2")),), (0,), free_gain=True),
+                      (replace(data, force=data.force / gain),), scenario("S2", 2, 0))
+    found = fit(problem)
+    if refine:
+        found = output_error(found, [replace(recording, force=recording.force / gain)], iterations=8)
+    assert found.values["gain"] == pytest.approx(gain, rel=2e-3)
+    assert found.values["f[1]"] == pytest.approx(20.0, rel=1e-3)
+    assert "gain" not in problem.piled(found.theta)
+
+
+def test_a_gain_without_a_force_is_refused():
+    model = beam(2)
+    data = integrated(model, lambda q, v: 0 * q, u0=np.array([2e-3, 5e-4]), seconds=1.0, rate=512.0)
+    with pytest.raises(ValueError, match="no recording holds a force"):
+        Problem(Model(model, (), (0,), free_gain=True), (data,), scenario("S1", 2, 0))

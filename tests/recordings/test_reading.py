@@ -299,3 +299,15 @@ def test_arbitrary_bytes_raise_input_errors_only(tmp_path: Path, data: bytes, su
     except InputError:
         return
     assert arrays
+
+
+def test_an_offset_is_taken_from_the_samples_before_anything_else(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    path.write_bytes(npz_bytes(acc=ACC, force=FORCE))
+    plain = read_recording(RecordingSpec(str(path), "run", CHANNELS, rate=RATE))
+    shifted = read_recording(RecordingSpec(str(path), "run", (replace(CHANNELS[0], offset=0.5), replace(CHANNELS[1], offset=-0.25)),
+                                           rate=RATE))
+    np.testing.assert_allclose(shifted.force, plain.force - 0.5, atol=1e-12)
+    np.testing.assert_allclose(shifted.response, plain.response - 0.25 * 9.80665, atol=1e-12)     # polarity -1, unit g
+    with pytest.raises(InputError, match="offset"):
+        replace(CHANNELS[0], offset=float("nan"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -81,3 +83,35 @@ def test_wrong_records_are_named() -> None:
     elsewhere = Recording("r", 0.01, np.zeros((10, 2)), CHANNELS, np.zeros((10, 1)), (Channel("f", "tip", "force", "N"),))
     with pytest.raises(ValueError, match="no inputs"):
         predict_record(model, IWAN, elsewhere)
+
+
+@pytest.mark.parametrize("period", [None, 200])
+def test_a_gain_is_a_gain_of_the_recorded_force(period: int | None) -> None:
+    model = oscillator("cubic", frequency=30.0, zeta=0.05, free=True)
+    known, open_ = replace(model, free_gain=False), replace(model, free_gain=True)
+    force = np.tile(multisine(200, 30)[:, :1], (2, 1))
+    source = Recording("r", 1e-3, np.zeros((400, 1)), (Channel("d", "x", "displacement", "m"),), force, (Channel("f", "x", "force", "N"),),
+                       period=period)
+    theta = np.array([[30.0, 0.05, 3e8], [31.0, 0.04, 2e8]])
+    gains = np.array([0.8, 1.3])
+    assert open_.names[2] == "gain" and open_.start([0.0])[2] == 1.0
+    found = predict_record(open_, np.insert(theta, 2, gains, axis=1), source, substeps=2)
+    for i, gain in enumerate(gains):
+        alone = predict_record(known, theta[i], replace(source, force=gain * force), substeps=2)
+        # a batch settles as long as its slowest sample needs
+        exact = 1e-12 if period is None else 1e-6
+        np.testing.assert_allclose(found.values[i], alone.values[0], rtol=0, atol=exact * np.abs(alone.values).max())
+
+
+def test_a_steady_state_begins_where_the_period_does() -> None:
+    # forgotten within a fraction of the period: the run starts inside a period, the response must not
+    model = oscillator("cubic", frequency=60.0, zeta=0.1)
+    force = multisine(600, 60)[:, :1] * 20
+    source = Recording("r", 1e-3, np.zeros((600, 1)), (Channel("d", "x", "displacement", "m"),), force, (Channel("f", "x", "force", "N"),),
+                       period=600)
+    steady = predict_record(model, [[1e8]], source, substeps=4)
+    three = replace(source, response=np.zeros((1800, 1)), force=np.tile(force, (3, 1)), period=None)
+    long = predict_record(model, [[1e8]], three, substeps=4)
+    assert steady.ok.all()
+    last = long.values[0, 1200:-10]
+    np.testing.assert_allclose(steady.values[0, :590], last, atol=2e-3 * np.abs(last).max())
