@@ -140,7 +140,6 @@ def nonlinear_jacobian(problem: Problem, s: NDArray[np.float64], low: NDArray[np
         rows = np.repeat(s[None], len(columns) + 1, axis=0)
         rows[np.arange(1, len(columns) + 1), columns] += move
         values = piece.values(problem.to_theta(rows))
-        force = sum((problem.observed.force(piece.element.term, name, values, piece.element.excess, problem.places) for name in piece.locations),
-                    np.zeros((len(rows), problem.size)))
+        force = problem.observed.force(piece.element.term, piece.locations, values, piece.element.excess, problem.places)
         out[:, columns] = ((force[1:] - force[0]) / move[:, None]).T
     return out

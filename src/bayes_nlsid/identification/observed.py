@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import final
 
@@ -69,7 +70,7 @@ class Observed:
     record: NDArray[np.intp] = field(init=False, repr=False)
     linear_force: NDArray[np.float64] = field(init=False, repr=False)
     _motions: dict[tuple[int, str, bool], Motion] = field(init=False, repr=False, default_factory=dict)
-    _tables: dict[tuple[str, str, str, int], ForceTable] = field(init=False, repr=False, default_factory=dict)
+    _tables: dict[tuple[tuple[str, ...], str, str, int], ForceTable] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.data:
@@ -171,19 +172,22 @@ class Observed:
         force = force_along(term, path, p, excess)
         return force[..., part] if memory else force
 
-    def force(self, term: Term, location: str, p: ArrayLike, excess: bool, places: int = 0) -> NDArray[np.float64]:
-        """In-band contribution (..., N) of one location to the residual, b_l f(q_l, v_l; p), for p (..., n_p).
+    def force(self, term: Term, locations: Sequence[str], p: ArrayLike, excess: bool, places: int = 0) -> NDArray[np.float64]:
+        """In-band contribution (..., N) of a term to the residual, Σ b_l f(q_l, v_l; p) over locations that share p (..., n_p).
 
         With ``places`` the law is interpolated between so many displacements where it allows that (see ``table``); 0 is exact.
         """
+        def exact(law: Term, values: ArrayLike, spring_off: bool) -> NDArray[np.float64]:
+            return np.asarray(sum(self._exact_force(law, name, values, spring_off) for name in locations))
+
         kind = symmetry_of(term, 1.0) if places else None
         if kind is None:
-            return self._exact_force(term, location, p, excess)
-        key = (location, term.memory, kind, places)
+            return exact(term, p, excess)
+        key = (tuple(locations), term.memory, kind, places)
         if key not in self._tables:
             # Memory runs through all samples, also those that are not fitted.
-            reach = max(float(np.max(np.abs(self.path(r, location)[0]))) for r in range(len(self.data)))
-            self._tables[key] = build(lambda t, x: self._exact_force(t, location, x, False), term.memory, kind, reach, places)
+            reach = max(float(np.max(np.abs(self.path(r, name)[0]))) for r in range(len(self.data)) for name in locations)
+            self._tables[key] = build(lambda t, x: exact(t, x, False), term.memory, kind, reach, places)
         return self._tables[key].force(term, p, excess)
 
     def _exact_force(self, term: Term, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:

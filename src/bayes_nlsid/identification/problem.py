@@ -161,8 +161,7 @@ class Problem:
 
     def _piece_force(self, piece: Piece, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         values = piece.values(theta)
-        return sum((self.observed.force(piece.element.term, name, values, piece.element.excess, self.places) for name in piece.locations),
-                   np.zeros((*theta.shape[:-1], self.observed.size)))
+        return self.observed.force(piece.element.term, piece.locations, values, piece.element.excess, self.places)
 
     # -- the residual ------------------------------------------------------------------------------------------------------------
 
