@@ -37,7 +37,7 @@ def gaussian(x):
 
 
 def settled(likelihood, start, **options):
-    return sample(start, likelihood=likelihood, priors=flat_priors(start.problem), seed=3, most=4000, **options)
+    return sample(start, likelihood=likelihood, priors=flat_priors(start.problem), seed=3, **{"most": 4000, **options})
 
 
 @pytest.mark.parametrize("scale", [0.01, pytest.param(100.0, marks=pytest.mark.slow)])
@@ -88,7 +88,7 @@ def test_the_posterior_does_not_depend_on_c():
     for c in (1.0, 20 * bound):
         start = lend(1, c)
         likelihood = Written(start, lambda x: -0.5 * ((x[:, 0] - 0.06) / 0.03) ** 2)
-        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=600, most=1000)
+        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=400, most=800)
         quantiles.append(found.quantiles([0.16, 0.5, 0.84])[:, 0] / start.problem.bounds[0, 1])
         assert found.convergence.rhat_max < 1.05
     sd = 0.5 * (quantiles[1][2] - quantiles[1][0])
@@ -98,7 +98,7 @@ def test_the_posterior_does_not_depend_on_c():
 
 def test_resumed_runs_are_the_same_to_the_last_bit(tmp_path):
     start = lend(2)
-    options = {"steps": 300, "block": 100, "ensembles": 2}
+    options = {"steps": 150, "block": 50, "ensembles": 2, "most": 800}
     whole = settled(Written(start, gaussian), start, **options)
     calls = []
     part = settled(Written(start, gaussian), start, store=tmp_path, stop=lambda: calls.append(1) or len(calls) == 5, **options)
@@ -118,7 +118,7 @@ import sys
 from tests.inference.test_sampling import settled, slow
 from tests.inference.targets import Written, lend
 if __name__ == "__main__":
-    settled(Written(lend(2), slow), lend(2), store=sys.argv[1], steps=300, block=50, ensembles=2)
+    settled(Written(lend(2), slow), lend(2), store=sys.argv[1], steps=150, block=25, ensembles=2, most=800)
 """
 
 
@@ -140,7 +140,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     finished = len(list(tmp_path.glob("ensemble*.npz")))
     assert 5 <= finished < 28
     start = lend(2)
-    options = {"steps": 300, "block": 50, "ensembles": 2}
+    options = {"steps": 150, "block": 25, "ensembles": 2, "most": 800}
     assert np.array_equal(settled(Written(start, slow), start, store=tmp_path, **options).theta,
                           settled(Written(start, gaussian), start, **options).theta)
 
@@ -176,9 +176,9 @@ def test_two_modes_far_apart_are_flagged(monkeypatch):
 
     scatter = 1e-4 * np.random.default_rng(0).normal(size=(2, 20, 1))
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
-    same = settled(Written(start, two), start, ensembles=2, steps=500)
+    same = settled(Written(start, two), start, ensembles=2, steps=300)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
-    apart = settled(Written(start, two), start, ensembles=2, steps=500)
+    apart = settled(Written(start, two), start, ensembles=2, steps=300)
     assert same.status == "ok"
     assert apart.status == "not_converged" and any("disagree" in r for r in apart.reasons)
 
@@ -232,7 +232,7 @@ def test_progress_and_refusals():
     start = lend(1)
     likelihood = Written(start, lambda x: -0.5 * (x[:, 0] / 0.1) ** 2)
     seen = []
-    sample(start, likelihood=likelihood, seed=0, steps=200, most=1000, ensembles=2, block=100, 
+    sample(start, likelihood=likelihood, seed=0, steps=100, most=400, ensembles=2, block=50,
            progress=lambda share, text: seen.append((share, text)))
     assert seen[-1][0] == 1.0 and "left" in seen[0][1] and all(0 <= share <= 1 for share, _ in seen)
     for wrong in ({"walkers": 3}, {"walkers": 21}, {"ensembles": 0}, {"block": 1}, {"most": 10}):
@@ -245,7 +245,7 @@ def test_progress_and_refusals():
 def test_failed_evaluations_are_counted_with_their_place():
     start = lend(1)
     likelihood = Written(start, lambda x: np.where(x[:, 0] > 0.05, -np.inf, -0.5 * (x[:, 0] / 0.1) ** 2))
-    found = sample(start, likelihood=likelihood, seed=0, steps=200, most=1000, ensembles=2, block=100)
+    found = sample(start, likelihood=likelihood, seed=0, steps=100, most=400, ensembles=2, block=50)
     assert found.failures > 0 and (found.failed_at / start.problem.bounds[0, 1] > 0.05).all()
 
 
@@ -253,7 +253,7 @@ def test_inference_data_and_netcdf(tmp_path):
     problem = Problem(Model(beam(), (Element(LIBRARY["q|q|"], ("J1",)),), (0,)), (run(2.0, 5),), scenario("S2", 3, 0))
     start = fit(problem)
     likelihood = WhittleLikelihood(start)
-    found = sample(start, likelihood=likelihood, seed=1, steps=200, most=1000, ensembles=2, block=100)
+    found = sample(start, likelihood=likelihood, seed=1, steps=60, most=400, ensembles=2, block=20)
     data = to_inference_data(found, likelihood, blocks_of=40)
     assert set(data.groups()) == {"posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data"}
     chain = data["posterior"]["q|q|[J1].c"]

@@ -13,7 +13,7 @@ from tests.simulation.problems import IWAN, beam, oscillator
 
 
 def test_duffing_bands_follow_the_elliptic_integral() -> None:
-    model = oscillator("cubic", zeta=0.004)
+    model = oscillator("cubic", zeta=0.008)
     draws = np.array([[2e4], [3e4], [4e4]])
     bands = backbone_bands(draws, model, at="x", start_amplitude=0.1, amplitudes=np.array([0.03, 0.05, 0.08]), scheme="exponential",
                            fs=2000)

@@ -22,7 +22,7 @@ def sweep(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def record(n: int, noise: float, forced: bool = False, u0: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Recording:
-    fine = 16
+    fine = 8
     force = sweep(np.arange((n - 1) * fine + 1) / (fine * FS))[:, None]
     applied = force if forced else None
     clean = simulate(MODEL, IWAN, fs=FS * fine, samples=(n - 1) * fine + 1, u0=u0, force=applied, keep=("tip", "shaker"), every=fine,

@@ -115,7 +115,8 @@ run.run_study(read_study(sys.argv[1]), Path(sys.argv[2]))
 """
 
 
-@pytest.mark.parametrize("stage", ["read", "linear", "identify", "report"])
+@pytest.mark.parametrize("stage", [pytest.param("read", marks=pytest.mark.slow), "linear", pytest.param("identify", marks=pytest.mark.slow),
+                                   "report"])
 def test_kill_and_resume_gives_the_same_numbers(stage: str, small: Path, finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     killed = subprocess.run([sys.executable, "-c", KILLER, str(small), str(out), stage], env=ENVIRONMENT, check=False)

@@ -142,17 +142,21 @@ def example_recording() -> dict[str, np.ndarray]:
     force = 0.25 * sum(np.cos(2 * np.pi * f * half + p) for f, p in zip(lines, phase, strict=True))
     omega, zeta, cubic = 2 * np.pi * 20.3, 0.012, 4e8
 
-    def slope(y: np.ndarray, f: float) -> np.ndarray:
-        return np.array([y[1], f - 2 * zeta * omega * y[1] - omega**2 * y[0] - cubic * y[0] ** 3])
+    def slope(x: float, v: float, f: float) -> float:
+        return f - 2 * zeta * omega * v - omega**2 * x - cubic * x * x * x
 
-    h, state, states = 1 / (inner * fs), np.zeros(2), []
+    h, x, v, states, applied = 1 / (inner * fs), 0.0, 0.0, [], force.tolist()  # plain numbers: five times quicker than small arrays
     for i in range(inner * count):
+        a = slope(x, v, applied[2 * i])
         if i % inner == 0:
-            states.append(slope(state, force[2 * i])[1])
-        a = slope(state, force[2 * i])
-        b = slope(state + 0.5 * h * a, force[2 * i + 1])
-        c = slope(state + 0.5 * h * b, force[2 * i + 1])
-        state = state + h / 6 * (a + 2 * b + 2 * c + slope(state + h * c, force[2 * i + 2]))
+            states.append(a)
+        v1 = v + 0.5 * h * a
+        b = slope(x + 0.5 * h * v, v1, applied[2 * i + 1])
+        v2 = v + 0.5 * h * b
+        c = slope(x + 0.5 * h * v1, v2, applied[2 * i + 1])
+        v3 = v + h * c
+        d = slope(x + h * v2, v3, applied[2 * i + 2])
+        x, v = x + h / 6 * (v + 2 * v1 + 2 * v2 + v3), v + h / 6 * (a + 2 * b + 2 * c + d)
     acceleration = np.array(states)
     noise = 2e-3 * acceleration.std() * rng.standard_normal((2, count))
     return {"acceleration": acceleration + noise[0], "force": force[:2 * inner * count:2 * inner], "quiet": noise[1], "fs": np.array(fs)}
