@@ -19,6 +19,7 @@ from bayes_nlsid.identification.fit import Fit, Start
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.spectrum import Spectrum
 from bayes_nlsid.recordings.recording import Recording
+from bayes_nlsid.simulation.integration import EVEN_BATCH, LONG_RUN
 from bayes_nlsid.simulation.replay import predict_record
 
 Array = NDArray[np.float64]
@@ -57,6 +58,8 @@ class OutputError:
     runs : tuple of _Run
     substeps : tuple of int
         Integration steps per sample, fixed so that differences do not see the integrator change.
+    compiled : bool or None
+        Which time loop; None leaves it to each simulation.
     coordinates : Coordinates
         Those of the problem, but with a symlog constant of a tenth of the bound: on the way from one sign of a coefficient to the
         other a search must not cross the many decades around zero.
@@ -65,6 +68,7 @@ class OutputError:
     problem: Problem
     runs: tuple[_Run, ...] = field(repr=False)
     substeps: tuple[int, ...]
+    compiled: bool | None = None
     coordinates: Coordinates = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -95,7 +99,7 @@ class OutputError:
             states = x[:, at:at + len(run.unknown)]
             at += len(run.unknown)
             u0, v0 = _state(run, states)
-            found = predict_record(self.problem.model, theta, run.recording, substeps=substeps, u0=u0, v0=v0)
+            found = predict_record(self.problem.model, theta, run.recording, substeps=substeps, u0=u0, v0=v0, compiled=self.compiled)
             with np.errstate(all="ignore"):
                 values = np.moveaxis(run.spectrum.apply(np.moveaxis(found.values / run.scale, 1, 2)), 1, 2) - run.measured
             values[~found.ok] = np.inf
@@ -148,7 +152,7 @@ def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int =
     if not np.isfinite(fit.theta).all():
         raise ValueError(f"the fit has failed ({', '.join(fit.reasons)}); output error needs a finite starting point")
     began = time.perf_counter()
-    error, x = _prepare(fit, recordings, tolerance)
+    error, x = _prepare(fit, recordings, tolerance, iterations)
     first = error.residual(x[None])[0]
     if not np.isfinite(first).all():
         return replace(fit, reasons=(*fit.reasons, "output error: the simulation from the regression failed; the regression stands"))
@@ -165,7 +169,7 @@ def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int =
                problem, fit.weights, fit.seed)
 
 
-def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float) -> tuple[OutputError, Array]:
+def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float, iterations: int) -> tuple[OutputError, Array]:
     problem = fit.problem
     named = {d.name: i for i, d in enumerate(problem.data)}
     missing = [r.name for r in recordings if r.name not in named]
@@ -182,11 +186,15 @@ def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float) -> tup
     scales = _scales([c[0] for c in cut], measured)
     runs = tuple(_Run(part, spectrum, values / scale, scale, u0, v0, spread)
                  for (part, u0, v0, spread), spectrum, values, scale in zip(cut, spectra, measured, scales, strict=True))
+    # many runs follow: the compiled loop is worth loading for all of them where it would not be for one
+    batch = len(problem.names) + sum(len(run.unknown) for run in runs) + len(DAMPINGS)
+    compiled = True if iterations * (1 + batch / EVEN_BATCH) * sum(run.recording.n for run in runs) > LONG_RUN else None
     substeps = []
     for run in runs:
         u0, v0 = _state(run, np.zeros((1, len(run.unknown))))
-        substeps.append(predict_record(problem.model, fit.theta[None], run.recording, tolerance=tolerance, u0=u0, v0=v0).substeps)
-    error = OutputError(problem, runs, tuple(substeps))
+        substeps.append(predict_record(problem.model, fit.theta[None], run.recording, tolerance=tolerance, u0=u0, v0=v0,
+                                       compiled=compiled).substeps)
+    error = OutputError(problem, runs, tuple(substeps), compiled)
     return error, np.concatenate([error.coordinates.to_s(fit.theta), np.zeros(error.size[1])])
 
 

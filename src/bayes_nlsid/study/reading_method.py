@@ -226,7 +226,7 @@ def read_prediction(table: Table | None, locations: Sequence[str], recordings: S
         table.number("seconds", "time", None, positive=True), table.number("fs", "frequency", None, positive=True),
         table.text("scheme", "hht", ("hht", "exponential")), table.numbers("amplitudes", "length", ()), table.text("measured", None),
         table.span("band", "frequency", None), heldout, table.integer("draws", 100, low=2),
-        table.text("score", "band", ("band", "all")))
+        table.text("score", "band", ("band", "all")), table.number("tolerance", "ratio", None, positive=True))
     table.close()
     return entry
 
