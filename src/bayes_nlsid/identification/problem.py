@@ -59,7 +59,7 @@ class Problem:
     taper : float
         Fraction of a transient under cosine edges; steady periods are never tapered.
     places : int
-        Displacements between which force laws are interpolated (see ``table``), 0 for none: then every evaluation walks through all samples.
+        Displacements between which force laws are interpolated (see ``table``), 0 for none: each evaluation then walks through all samples.
     observed : Observed or None
         Prepared recordings to share between problems that differ in their elements only.
 

@@ -171,8 +171,8 @@ class PredictionEntry:
 
     ``at`` names the location whose amplitude is meant, ``amplitude`` (m) where the release starts, ``mode`` is 1-based, ``seconds``
     the length of the decay, ``samples`` the number of posterior draws. ``score`` says where records kept for judging are compared:
-    ``"band"``, that of the identification, or ``"all"`` frequencies, zero included; ``tolerance`` is the relative error of the integrator accepted for them (by
-    default a fifth of the noise).
+    ``"band"``, that of the identification, or ``"all"`` frequencies, zero included; ``tolerance`` is the relative error of the
+    integrator accepted for them (by default a fifth of the noise).
     """
 
     at: str

@@ -135,8 +135,8 @@ def _heldout(context: Context, entry: PredictionEntry, model: Model, draws: Arra
     for i, name in enumerate(entry.heldout):
         recording = context.recordings[name]
         context.progress(0.7 + 0.3 * i / len(entry.heldout), f"predicting {name}")
-        common: dict[str, Any] = {"band": band_of(context, context.model) if entry.score == "band" else None, "noise": context.noise(recording),
-                                  "tolerance": entry.tolerance}
+        common: dict[str, Any] = {"band": band_of(context, context.model) if entry.score == "band" else None,
+                                  "noise": context.noise(recording), "tolerance": entry.tolerance}
         judged = heldout(model, draws, recording, seed=context.number(f"heldout {name}"), **common)
         linear = heldout(Model(context.model), np.zeros((1, 0)), recording, **common)
         arrays |= {f"held{i}.time": judged.time, f"held{i}.measured": judged.measured, f"held{i}.q05": judged.q05,
