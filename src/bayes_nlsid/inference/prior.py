@@ -152,8 +152,9 @@ def default_priors(problem: Problem) -> tuple[Prior, ...]:
 
     Frequencies and damping ratios: normal around the modal test with its own standard deviation (``omega_sd``, ``zeta_sd``), or half the
     bound where none is stated. The gain of the force: log-uniform. Signed coefficients: normal around 0 with a tenth of the bound, i.e. a
-    force of a tenth of the whole linear force; the bound alone, a force as large as everything linear, is far too generous. Stiffnesses, forces, displacements and
-    velocities: log-uniform over the bounds. Ranges: uniform if they include 0 or span less than two decades, else log-uniform.
+    force of a tenth of the whole linear force; the bound alone, a force as large as everything linear, is far too generous. Stiffnesses,
+    forces, displacements and velocities: log-uniform over the bounds. Ranges: uniform if they include 0 or span less than two decades,
+    else log-uniform.
     """
     linear = problem.model.linear
     out = []
