@@ -259,7 +259,7 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
         reason = f"mean square {current.mse:.3g} -> {fits[best].mse:.3g}" + ("" if accepted else f", less than eps2 = {search.eps2:.3g}")
     else:
         clear = [name for name in order if _clear(values[name], limits[name], current.mse - fits[name].mse, current.mse)]
-        best = clear[0] if clear else order[0]
+        best = _smallest(clear, fits, variance, search.problem.rounding_floor) if clear else order[0]
         accepted = bool(clear) and current.mse > search.problem.rounding_floor
         reason = f"mean square {current.mse:.3g} -> {fits[best].mse:.3g}; {values[best]:.3g} against {limits[best]:.3g} by noise"
         if not accepted:
@@ -273,6 +273,13 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
 def _clear(statistic: float, limit: float, drop: float, mse: float) -> bool:
     """Whether a term does more than noise: above its limit, and by a twentieth of what was left or tenfold."""
     return statistic > limit and (drop > LEAST_GAIN * mse or statistic > 10 * limit)
+
+
+def _smallest(clear: list[str], fits: dict[str, Fit], variance: NDArray[np.float64], rounding: float) -> str:
+    """Of the candidates as good as the best (to a twentieth, or as far as noise can tell) the one with the fewest parameters."""
+    first = fits[clear[0]]
+    level = [name for name in clear if fits[name].mse <= (1 + LEAST_GAIN) * first.mse or _same(fits[name], first, variance, rounding)]
+    return min(level, key=lambda name: (len(fits[name].theta), level.index(name)))
 
 
 def _same(other: Fit, best: Fit, variance: NDArray[np.float64], rounding: float) -> bool:

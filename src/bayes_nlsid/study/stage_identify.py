@@ -131,8 +131,7 @@ def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData,
         if variant.candidates:
             candidates = _candidates(context, variant, bare, entry)
             selection = select(problem, candidates, eps1=entry.eps1, eps2=entry.eps2, starts=entry.starts, seed=seed,
-                               workers=context.workers,
-                               progress=progress)
+                               most=entry.most, workers=context.workers, progress=progress)
             found, linear = selection.fit, selection.mse_linear
         else:
             progress(0.1, "fitting")
