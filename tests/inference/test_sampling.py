@@ -176,9 +176,9 @@ def test_two_modes_far_apart_are_flagged(monkeypatch):
 
     scatter = 1e-4 * np.random.default_rng(0).normal(size=(2, 20, 1))
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
-    same = settled(Written(start, two), start, ensembles=2, steps=300)
+    same = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
-    apart = settled(Written(start, two), start, ensembles=2, steps=300)
+    apart = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
     assert same.status == "ok"
     assert apart.status == "not_converged" and any("disagree" in r for r in apart.reasons)
 
