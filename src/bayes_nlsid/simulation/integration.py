@@ -21,6 +21,8 @@ QUANTITIES = ("displacement", "velocity", "acceleration")
 BLOCK_BYTES = 2**25
 LONG_RUN = 100_000
 """Steps of numpy (each at the price of one small batch) beyond which the compiled loop is worth loading."""
+LOOP_PRICE = 10
+"""Price of a numpy step with a Bouc–Wen loop over one without."""
 EVEN_BATCH = 50
 """Samples at which a numpy step costs twice that of one sample."""
 
@@ -105,7 +107,8 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     coefficients = steps(omega[0], zeta[0], 1 / fs, scheme, alpha) if same else steps(omega, zeta, 1 / fs, scheme, alpha)
     first = coefficients if same else steps(omega[0], zeta[0], 1 / fs, scheme, alpha)
     period_error, false_damping = spectrum(first, omega[0], zeta[0])
-    wanted = compiled if compiled is not None else samples * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
+    price = LOOP_PRICE if any(element.term.memory == "bouc_wen" for element in model.elements) else 1
+    wanted = compiled if compiled is not None else samples * price * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
     stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None,
                             wanted)
     window = int(np.ceil(fs / (omega.min() / (2 * np.pi)) / every)) * every
