@@ -1,4 +1,4 @@
-"""The benchmark studies, whole, as the command line runs them: errors of the official tests against what was measured when they were made."""
+"""The benchmark studies, whole: errors on the official tests against the limits and against what was measured before."""
 
 from __future__ import annotations
 
