@@ -21,6 +21,7 @@ from bayes_nlsid.identification.fit import Fit, fit
 from bayes_nlsid.identification.noise import WIDTH, freedom, smoothed_variance
 from bayes_nlsid.identification.problem import Problem
 
+REFITS = 16           # starts of the refit with the likelihood's own weights
 ENTRIES = 4_000_000   # residual entries held at once
 
 
@@ -193,7 +194,8 @@ class WhittleLikelihood(Likelihood):
         problem, current = start.problem, start
         for _ in range(iterations):
             weights = 1 / whittle_variance(problem, current.theta, width)
-            again = fit(problem, starts=1, seed=start.seed, weights=weights, warm=current.theta)
+            # Other weights may favour another optimum: look for it, beside the one that is known.
+            again = fit(problem, starts=REFITS, seed=start.seed, weights=weights, warm=current.theta)
             current = again if np.isfinite(again.mse) else current
         self.width = width
         self.fit = current
