@@ -74,9 +74,23 @@ def digits_for(low: float, high: float) -> int:
     return int(np.clip(np.ceil(np.log10(size / width)) + 2, 3, 8))
 
 
-def short_names(names: Sequence[str]) -> list[str]:
-    """Names of parameters broken after the location, so that they fit above a small panel."""
-    return [name.replace("].", "]\n") for name in names]
+def places(locations: Sequence[str]) -> str:
+    """Locations as people read them: ``J1, J2``, and ``J1 … J5`` for more than two."""
+    return ", ".join(locations) if len(locations) <= 2 else f"{locations[0]} … {locations[-1]}"
+
+
+def brief(text: str) -> str:
+    """A text whose tied locations are abbreviated: ``cubic[J1+J2+J3].k`` → ``cubic[J1 … J3].k``; all else stays."""
+    return re.sub(r"\[([^\[\]+\s]+(?:\+[^\[\]+\s]+){2,})\]", lambda m: f"[{places(m.group(1).split('+'))}]", text)
+
+
+def brief_names(names: Sequence[str]) -> list[str]:
+    """Every name abbreviated as in `brief`, but whole where two different names would come to read the same."""
+    short = [brief(name) for name in names]
+    meant: dict[str, set[str]] = {}
+    for name, abbreviated in zip(names, short, strict=True):
+        meant.setdefault(abbreviated, set()).add(name)
+    return [name if len(meant[abbreviated]) > 1 else abbreviated for name, abbreviated in zip(names, short, strict=True)]
 
 
 def thinned(length: int, most: int) -> slice:

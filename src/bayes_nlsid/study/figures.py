@@ -7,6 +7,7 @@ Colours are those of Okabe and Ito, which people with any colour vision can tell
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
@@ -54,6 +55,62 @@ def png(draw: Any, *arguments: Any, **options: Any) -> bytes:
         buffer = BytesIO()
         figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
         return buffer.getvalue()
+
+
+def text_width(text: str, size: float) -> float:
+    """Width in inches of the widest line of a text at a font size in points, in the font of the common style."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    font = FontProperties(family=STYLE["font.family"])
+    return max(float(TextPath((0, 0), line.replace("$", r"\$"), size=size, prop=font).get_extents().x1) if line.strip() else 0.0
+               for line in text.split("\n")) / 72.0
+
+
+def fitted(text: str, width: float, size: float) -> str:
+    """A text broken into lines no wider than ``width`` inches: before a bracket if that is enough, then at spaces, then anywhere.
+
+    Parameters
+    ----------
+    text : str
+        Its own line breaks stay.
+    width : float
+        Inches.
+    size : float
+        Font size, points.
+    """
+    return "\n".join("\n".join(_broken(line, width, size, 0)) for line in text.split("\n"))
+
+
+_BREAKS = (r"(?=\[)|(?<=\]\.)", r"(?<= )", r"(?<=[+._\]/-])", r"(?<=.)(?=.)")
+
+
+def _broken(line: str, width: float, size: float, level: int) -> list[str]:
+    """Lines of one line, broken at the coarsest level of `_BREAKS` that fits."""
+    if level == len(_BREAKS) or text_width(line, size) <= width:
+        return [re.sub(r"\]\.$", "]", line.strip())]  # the dot before a parameter on its own line says nothing
+    lines: list[str] = []
+    for piece in re.split(_BREAKS[level], line):
+        if lines and text_width((lines[-1] + piece).rstrip(), size) <= width:
+            lines[-1] += piece
+        else:
+            lines.append(piece)
+    return [part for found in lines for part in _broken(found, width, size, level + 1)]
+
+
+def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str]) -> None:
+    """A legend under the panels in as many columns as fit the figure, labels wrapped; the figure grows by the legend's height."""
+    if not handles:
+        return
+    size, room = float(STYLE["legend.fontsize"]), WIDTH - 0.2
+    for columns in (3, 2, 1):
+        share = room / columns - 0.6  # handle, gaps between columns
+        wrapped = [fitted(label, share, size) for label in labels]
+        if columns == 1 or all("\n" not in text for text in wrapped) or (columns == 2 and max(t.count("\n") for t in wrapped) < 2):
+            break
+    legend = figure.legend(handles, wrapped, loc="outside lower center", ncols=columns, columnspacing=1.2)
+    extent = legend.get_window_extent()
+    figure.set_figheight(figure.get_figheight() + float(extent.height) / figure.dpi)
 
 
 def envelope(time: Array, signal: Array, columns: int = 1500) -> tuple[Array, Array, Array]:

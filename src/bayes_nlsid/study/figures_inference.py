@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from bayes_nlsid.study.axes import scaled, short_names
-from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, RED, canvas
+from bayes_nlsid.study.axes import brief_names, scaled
+from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, RED, WIDTH, canvas, fitted
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,10 @@ def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str]
     count = len(names)
     columns = min(4, count)
     rows = -(-count // columns)
-    figure, grid = canvas(rows, columns, height=0.6 + 1.75 * rows)
+    known = [not len(identifiable) or bool(identifiable[i]) for i in range(count)]
+    titles = [fitted(name if sure else f"{name}\nnot identifiable", WIDTH / columns - 0.32, 8)
+              for name, sure in zip(brief_names(names), known, strict=True)]
+    figure, grid = canvas(rows, columns, height=0.6 + (1.6 + 0.13 * max(title.count("\n") for title in titles)) * rows)
     for i, axes in enumerate(grid.ravel()):
         if i >= count:
             axes.set_axis_off()
@@ -116,8 +119,7 @@ def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str]
         axes.axvspan(low, high, color=BLUE, alpha=0.10, linewidth=0, label="90 % interval")
         if fit is not None:
             axes.axvline(factor * fit[i], color=RED, linewidth=1.2, label="least squares")
-        flag = "" if not len(identifiable) or identifiable[i] else " – not identifiable"
-        axes.set_title(short_names([names[i]])[0] + flag, fontsize=8, color=RED if flag else "black")
+        axes.set_title(titles[i], fontsize=8, color="black" if known[i] else RED)
         axes.set(yticks=[], xlim=span, xlabel=unit or "–")
         axes.xaxis.set_major_locator(MaxNLocator(3))
     handles, labels = grid[0][0].get_legend_handles_labels()
@@ -136,7 +138,8 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
     """
     chosen = list(worst)[:5]
     k = len(chosen)
-    figure, grid = canvas(k, k, height=1.0 + 1.3 * k)
+    short = brief_names(names)
+    figure, grid = canvas(k, k, height=1.0 + 1.3 * k, sharex="col")
     some = draws[np.linspace(0, len(draws) - 1, min(len(draws), 1500)).astype(int)]
     for i, row in enumerate(chosen):
         for j, column in enumerate(chosen):
@@ -160,11 +163,11 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
             if i != j:
                 axes.yaxis.set_major_locator(MaxNLocator(3))
             if i == k - 1:
-                axes.set_xlabel(f"{short_names([names[column]])[0]}" + (f" ({ux})" if ux else ""), fontsize=7.5)
+                axes.set_xlabel(fitted(short[column] + (f" ({ux})" if ux else ""), WIDTH / k - 0.45, 7), fontsize=7)
             else:
-                axes.set_xticklabels([])
+                axes.tick_params(labelbottom=False)
             if j == 0 and i > 0:
-                axes.set_ylabel(f"{short_names([names[row]])[0]}" + (f" ({uy})" if uy else ""), fontsize=7.5)
+                axes.set_ylabel(fitted(short[row] + (f" ({uy})" if uy else ""), 1.1, 7), fontsize=7)
             elif i != j:
                 axes.set_yticklabels([])
     return figure
@@ -185,7 +188,7 @@ def convergence(log_probability: Array, chains: Array, names: Sequence[str], uni
     worst : sequence of int
         Parameters to show, at most three.
     """
-    chosen = list(worst)[:3]
+    chosen, short = list(worst)[:3], brief_names(names)
     figure, grid = canvas(1 + len(chosen), 1, height=1.2 + 1.15 * (1 + len(chosen)), sharex=True)
     steps = np.arange(log_probability.shape[1])
     low = np.quantile(log_probability[:, log_probability.shape[1] // 3:], 0.002)
@@ -198,7 +201,7 @@ def convergence(log_probability: Array, chains: Array, names: Sequence[str], uni
             axes = grid[row + 1][0]
             axes.fill_between(steps, quantiles[0], quantiles[2], color=color, alpha=0.15, linewidth=0)
             axes.plot(steps, quantiles[1], color=color, linewidth=0.9)
-            axes.set_ylabel(short_names([names[i]])[0] + (f"\n({unit})" if unit else ""), fontsize=7.5)
+            axes.set_ylabel(fitted(short[i] + (f" ({unit})" if unit else ""), 1.05, 7.5), fontsize=7.5)
     top = float(log_probability.max())
     grid[0][0].set_ylim(low - 0.1 * (top - low) - 1e-9, top + 0.1 * (top - low) + 1e-9)
     grid[0][0].set_ylabel("log-probability\n(median walker)", fontsize=7.5)

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayes_nlsid.study.axes import prefixed, unit_sign
-from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, RED, canvas, draw_signal, envelope
+from bayes_nlsid.study.axes import engineering, prefixed, unit_sign
+from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, RED, WIDTH, canvas, draw_signal, envelope, fitted, legend_below
 
 Array = NDArray[np.float64]
 BAND = "5–95 %"
@@ -22,11 +22,13 @@ def joint_loops(loops: Sequence[Mapping[str, object]]) -> Figure:
     Parameters
     ----------
     loops : sequence of dict
-        ``location``, ``q`` (n,) m, ``force`` (S, n) N, ``linear`` N/m (spring already in the linear model, for reference), ``unit`` of q.
+        ``location``, ``term``, ``q`` (n,) m, ``force`` (S, n) N, ``unit`` of q.
     """
     columns = min(3, max(1, len(loops)))
     rows = max(1, -(-len(loops) // columns))
-    figure, grid = canvas(rows, columns, height=0.5 + 2.5 * rows)
+    figure, grid = canvas(rows, columns, height=0.5 + 2.65 * rows)
+    spent = [_energy(loop) for loop in loops]
+    common = prefixed([values[1] for values in spent], "J")
     for i, axes in enumerate(grid.ravel()):
         if i >= len(loops):
             axes.set_axis_off()
@@ -38,17 +40,30 @@ def joint_loops(loops: Sequence[Mapping[str, object]]) -> Figure:
             axes.plot(fq * q, ff * force[k], color=BLUE, alpha=0.10, linewidth=0.8)
         axes.plot(fq * q, ff * np.median(force, axis=0), color=BLUE, linewidth=1.4, label="median")
         axes.plot([], [], color=BLUE, alpha=0.3, label="single posterior draws")
-        energy = np.abs(np.sum(0.5 * (force + np.roll(force, -1, axis=1)) * (np.roll(q, -1) - q), axis=1))
-        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95])
-        fe, ue = prefixed(high, "J")
-        lost = f"energy per cycle {fe * middle:.2g} ({fe * low:.2g}–{fe * high:.2g}) {ue}"
-        if high < 1e-6 * float(np.abs(force).max() * np.abs(q).max()):
-            lost = "no energy lost"
-        axes.set_title(f"{loops[i]['location']}, {loops[i].get('term', '')}\n{lost}".replace(", \n", "\n"), fontsize=8)
+        lost = "no energy lost"
+        if spent[i][2] >= 1e-6 * float(np.abs(force).max() * np.abs(q).max()) > 0.0:
+            lost = _spent(spent[i], *common)
+        title = fitted(f"{loops[i]['location']}, {loops[i].get('term', '')}\n{lost}".replace(", \n", "\n"), WIDTH / columns - 0.75, 8)
+        axes.set_title(title, fontsize=8)
         axes.set(xlabel=f"relative displacement ({uq})", ylabel=f"force beyond the linear model ({uf})" if i % columns == 0 else f"({uf})")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=2)
     return figure
+
+
+def _energy(loop: Mapping[str, object]) -> Array:
+    """Energy lost over the cycle, J: its 5, 50 and 95 % quantiles over the draws (trapezoidal rule round the closed loop)."""
+    q, force = np.asarray(loop["q"], dtype=float), np.asarray(loop["force"], dtype=float)
+    energy = np.abs(np.sum(0.5 * (force + np.roll(force, -1, axis=1)) * (np.roll(q, -1) - q), axis=1))
+    return np.asarray(np.quantile(energy, [0.05, 0.5, 0.95]))
+
+
+def _spent(energy: Array, factor: float, unit: str) -> str:
+    """Energy in words, in the unit of the joint that loses most, so that joints compare; in its own unit if that is far too large."""
+    if factor * energy[0] < 0.01:
+        factor, unit = prefixed(energy[1], "J")
+    low, middle, high = (engineering(factor * value) for value in energy)
+    return f"energy per cycle {middle} {unit}\n(90 %: {low}–{high} {unit})"
 
 
 def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | None = None, *, location: str = "",
@@ -69,7 +84,7 @@ def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | N
     numerical : ndarray (K,), optional
         The integrator's own error of frequency, Hz.
     """
-    figure, grid = canvas(1, 2, height=3.7)
+    figure, grid = canvas(1, 2, height=3.3)
     left, right = grid[0]
     everything = [bands["amplitude"], *([measured["amplitude"]] if measured else [])]
     fa, ua = prefixed(np.nanmax(np.concatenate(everything)), "m")
@@ -93,16 +108,31 @@ def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | N
                              label=str(span["label"]))
         axes.set_xscale("log")
         axes.set_xlabel(f"amplitude at {location} ({ua})" if location else f"amplitude ({ua})")
-    _limit(left, [bands["frequency_q05"], bands["frequency_q95"], *([measured["frequency"]] if measured else [])])
-    _limit(right, [100 * bands["damping_q05"], 100 * bands["damping_q95"], *([100 * measured["damping"]] if measured else [])], zero=True)
+    start, stop = compared(bands, measured)
+    shown = bands["amplitude"] >= start
+    for axes, key, factor in ((left, "frequency", 1.0), (right, "damping", 100.0)):
+        model = [factor * bands[f"{key}_{level}"][shown] for level in ("q05", "q50", "q95")]
+        _limit(axes, [*model, *([factor * measured[key]] if measured else [])], zero=axes is right)
+        if stop > start > 0.0:
+            axes.set_xlim(fa * start / 1.12, fa * stop * 1.12)
     left.set_ylabel("frequency (Hz)")
     right.set_ylabel("damping (% of critical)")
     if numerical is not None and np.isfinite(numerical).any():
         left.set_title(f"integrator's own error ≤ {np.nanmax(np.abs(numerical)):.1g} Hz", fontsize=8, color=GREY)
     handles, labels = left.get_legend_handles_labels()
     extra = [(h, n) for h, n in zip(*right.get_legend_handles_labels(), strict=True) if n not in labels]
-    figure.legend(handles + [h for h, _ in extra], labels + [n for _, n in extra], loc="outside lower center", ncols=3)
+    legend_below(figure, handles + [h for h, _ in extra], labels + [n for _, n in extra])
     return figure
+
+
+def compared(bands: Mapping[str, Array], measured: Mapping[str, Array] | None = None) -> tuple[float, float]:
+    """Amplitudes (m) from the smallest worth showing to the largest: from the measured points where there are any, else the model's."""
+    model = bands["amplitude"][np.isfinite(bands["frequency_q50"]) | np.isfinite(bands["damping_q50"])]
+    seen = np.zeros(0) if measured is None else measured["amplitude"][np.isfinite(measured["amplitude"])]
+    pooled = np.concatenate([model, seen])
+    if not pooled.size:
+        return 0.0, 0.0
+    return float(seen.min() if seen.size else model.min()), float(pooled.max())
 
 
 def _limit(axes: Axes, values: Sequence[Array], zero: bool = False) -> None:

@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from bayes_nlsid.study.axes import engineering
 from bayes_nlsid.study.progress import Progress
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
@@ -148,7 +149,7 @@ def _posterior(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
 
 def _backbone(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     from bayes_nlsid.study.figures import png
-    from bayes_nlsid.study.figures_prediction import backbone_bands
+    from bayes_nlsid.study.figures_prediction import backbone_bands, compared
 
     saved = done["predict"]
     arrays, data = saved.arrays, saved.data
@@ -161,7 +162,10 @@ def _backbone(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     image = png(backbone_bands, arrays, measured, location=data["at"], alternatives=rivals, published=published,
                 numerical=arrays.get("numerical_error_frequency"))
     circles = " Circles are measured directly from the recording by zero crossings and were not fitted." if measured is not None else ""
-    caption = f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND}{circles}"
+    start = compared(arrays, measured)[0]
+    below = (f" The model's curve goes on below what was measured, down to {engineering(float(arrays['amplitude'][0]), 'm')}, in "
+             "backbone.npz.") if arrays["amplitude"][0] < 0.8 * start else ""
+    caption = f"Backbone of mode {data['mode']}: frequency and damping against amplitude. {CAPTION_BAND}{circles}{below}"
     return [Picture("backbone", "prediction", caption, "stages/predict, backbone.npz", image)]
 
 
@@ -172,11 +176,23 @@ def _loops(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     saved = done["predict"]
     loops = [{**entry, "q": saved.arrays[f"loop{i}.q"], "force": saved.arrays[f"loop{i}.force"]}
              for i, entry in enumerate(saved.data.get("loops", []))]
-    if not loops:
+    moved = [loop for loop in loops if np.any(loop["force"])]
+    if not moved:
         return []
+    left_out = idle(saved)
+    rest = f" Left out, because the force is zero over this whole motion: {'; '.join(left_out)}." if left_out else ""
     caption = ("Force of every joint beyond the linear model over one steady cycle at the amplitude of the largest recorded motion; thin "
-               "lines are single posterior draws.")
-    return [Picture("joint_loops", "prediction", caption, "stages/predict", png(joint_loops, loops))]
+               f"lines are single posterior draws.{rest}")
+    return [Picture("joint_loops", "prediction", caption, "stages/predict", png(joint_loops, moved))]
+
+
+def idle(saved: Saved) -> list[str]:
+    """Force laws and places whose force is zero over the whole recorded motion in every draw: ``jenkins at J2_slip, J3_slip``."""
+    found: dict[str, list[str]] = {}
+    for i, entry in enumerate(saved.data.get("loops", [])):
+        if not np.any(saved.arrays[f"loop{i}.force"]):
+            found.setdefault(entry["term"], []).append(entry["location"])
+    return [f"{term} at {', '.join(where)}" for term, where in found.items()]
 
 
 def _heldout(study: Study, done: Mapping[str, Saved]) -> list[Picture]:

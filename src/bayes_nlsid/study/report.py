@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, final
 
 from bayes_nlsid.study import report_page as html
-from bayes_nlsid.study.axes import digits_for, engineering, unit_sign
-from bayes_nlsid.study.pictures import Picture
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, places, unit_sign
+from bayes_nlsid.study.pictures import Picture, idle
 from bayes_nlsid.study.progress import duration
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
-from bayes_nlsid.study.story import STATUS_WORDS, story
+from bayes_nlsid.study.story import sound, status_words, story
 
 
 @final
@@ -41,8 +41,7 @@ class Report:
 
 def render(report: Report) -> str:
     """The page as HTML, without any outside resource."""
-    status = str(report.result["status"])
-    badge = f'<span class="badge {"ok" if status == "ok" else "warn"}">{escape(STATUS_WORDS[status])}</span>'
+    badge = f'<span class="badge {"ok" if sound(report.result) else "warn"}">{escape(status_words(report.result))}</span>'
     sections: list[tuple[str, str, Callable[[Report], str]]] = [
         ("recordings", "Recordings", _recordings), ("linear", "Linear model", _linear), ("selection", "Which force laws", _selection),
         ("posterior", "Parameters and their uncertainty", _posterior), ("prediction", "What the model predicts", _prediction),
@@ -110,31 +109,38 @@ def _selection(report: Report) -> str:
         return ""
     rows = []
     for record in saved.data["variants"]:
-        terms = "; ".join(f"{e['term']} at {', '.join(e['locations'])}" for e in record["elements"]) or "none (linear)"
+        terms = "; ".join(f"{e['term']} at {places(e['locations'])}" for e in record["elements"]) or "none (linear)"
         share = 1 - record["mse"] / record["mse_linear"] if record["mse_linear"] > 0 else 0.0
         rows.append([record["name"], terms, f"{record['mse_linear']:.3g}", f"{record['mse']:.3g}", f"{record['floor']:.2g}",
                      f"{100 * share:.1f} %",
                      record["status"]])
     head = ["form", "force laws", "mean square, linear", "with them", "noise floor", "explained", "fit"]
     out = html.table(head, rows, f"stages/identify, scenario {saved.data['scenario']}", numeric=(2, 3, 4, 5))
-    steps = [[record["name"], s["action"], s["element"], f"{s['mse']:.4g}", "yes" if s["accepted"] else "no", s["reason"]]
+    steps = [[record["name"], s["action"], brief(s["element"]), f"{s['mse']:.4g}", "yes" if s["accepted"] else "no", brief(s["reason"])]
              for record in saved.data["variants"] for s in record.get("path", [])]
     if steps:
         steps_table = html.table(["form", "round", "candidate", "mean square", "accepted", "why"], steps, "stages/identify", numeric=(3,))
         out += f"<details open><summary>Every round of the selection</summary>{steps_table}</details>"
-    alike = [f"{r['name']}: the recordings do not tell {', '.join(r['aliases'])} from what was chosen" for r in saved.data["variants"]
-             if r.get("aliases")]
-    return out + html.listing(alike)
+    return out + "".join(_alike(record["name"], record["aliases"]) for record in saved.data["variants"] if record.get("aliases"))
+
+
+def _alike(form: str, aliases: Sequence[str], most: int = 6) -> str:
+    """What the recordings cannot tell from the choice: how many at once, the first of them on demand."""
+    count = f"{len(aliases)} other force law{'s' if len(aliases) > 1 else ''}"
+    more = f" and {len(aliases) - most} more (all of them: result.json, aliases)" if len(aliases) > most else ""
+    return html.details(f"{form}: the recordings do not tell {count} from what was chosen",
+                        html.paragraph(", ".join(brief_names(aliases)[:most]) + more))
 
 
 def _posterior(report: Report) -> str:
     rows = []
-    for p in report.result.get("parameters", []):
+    parameters = report.result.get("parameters", [])
+    for p, name in zip(parameters, brief_names([p["name"] for p in parameters]), strict=True):
         u = p["unit"]
         digits = digits_for(p["q05"], p["q95"]) if p.get("q05") is not None else 4
         quantiles = [engineering(p[q], u, digits) if p.get(q) is not None else "–" for q in ("q05", "q50", "q95")]
         known = "–" if "identifiable" not in p else "yes" if p["identifiable"] else "no: as wide as assumed"
-        rows.append([p["name"], engineering(p["fit"], u, digits) if p["fit"] is not None else "–", *quantiles, known,
+        rows.append([name, engineering(p["fit"], u, digits) if p["fit"] is not None else "–", *quantiles, known,
                      "–" if p.get("ess") is None else f"{p['ess']:.0f}"])
     head = ["parameter", "least squares", "5 %", "50 %", "95 %", "identifiable", "effective draws"]
     out = html.table(head, rows, "stages/identify, stages/posterior (posterior.nc)", numeric=(1, 2, 3, 4, 6))
@@ -147,9 +153,9 @@ def _posterior(report: Report) -> str:
              ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"],
              ["stuck walkers", str(c["stuck_walkers"])]]
     out += html.table(["sampler", ""], facts, "stages/posterior")
-    priors = [[p["parameter"], p["text"]] for p in saved.data.get("priors", [])]
+    priors = [[brief(p["parameter"]), brief(p["text"])] for p in saved.data.get("priors", [])]
     table = html.table(["parameter", "prior"], priors, "stages/posterior")
-    return out + f"<details><summary>What was assumed beforehand (priors)</summary>{table}</details>"
+    return out + html.details("What was assumed beforehand (priors)", table)
 
 
 def _prediction(report: Report) -> str:
@@ -166,7 +172,8 @@ def _prediction(report: Report) -> str:
                   "–" if p.damping is None else f"{100 * p.damping[0]:.3g}–{100 * p.damping[1]:.3g} %", p.text]
                  for p in report.study.report.published]
     out += html.table(["published by others", "frequency", "damping", ""], published, "the study file")
-    return out + html.listing(saved.data.get("notes", []))
+    silent = [f"No force over the whole recorded motion: {text}" for text in idle(saved)]
+    return out + html.listing([*map(brief, saved.data.get("notes", [])), *silent])
 
 
 def _provenance(report: Report) -> str:

@@ -41,7 +41,8 @@ figure img { display: block; width: 100%; min-width: 34rem; height: auto; backgr
 figcaption { color: var(--soft); font-size: .88rem; margin-top: .4rem; max-width: 46rem; }
 code, pre { font-family: ui-monospace, Consolas, monospace; font-size: .85em; }
 pre { background: var(--tint); padding: .8rem; overflow-x: auto; border-radius: 6px; }
-details summary { cursor: pointer; color: var(--accent); }
+details summary { cursor: pointer; color: var(--accent); overflow-wrap: anywhere; }
+p, li, figcaption { overflow-wrap: anywhere; }
 td.hash { font-family: ui-monospace, Consolas, monospace; font-size: .8em; word-break: break-all; }
 @media print {
   body { font-size: 10.5pt; } main { max-width: none; padding: 0; } nav { display: none; }
@@ -66,6 +67,11 @@ def paragraph(text: str, kind: str = "") -> str:
 def listing(items: Sequence[str]) -> str:
     """Plain texts as a list; nothing for none."""
     return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>" if items else ""
+
+
+def details(summary: str, content: str) -> str:
+    """HTML that opens on demand under a line of plain text."""
+    return f"<details><summary>{escape(summary)}</summary>{content}</details>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], source: str, numeric: Sequence[int] = (), hashes: Sequence[int] = ()) -> str:

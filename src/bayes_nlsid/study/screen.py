@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayes_nlsid.study.axes import digits_for, engineering
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering
 from bayes_nlsid.study.schema import Study
-from bayes_nlsid.study.story import STATUS_WORDS
+from bayes_nlsid.study.story import status_words
 
 WIDTH = 100
 
@@ -31,14 +31,15 @@ def _wrapped(text: str) -> str:
 
 def summary(result: Mapping[str, Any], out: Path) -> str:
     """One screen: what was found, parameters with 5/50/95 %, convergence, held-out error, files."""
-    parts = [f"{result['title']}: {STATUS_WORDS[result['status']]}"]
-    parts += [_wrapped(f"  reason: {reason}") for reason in result["reasons"][:4]]
+    parts = [f"{result['title']}: {status_words(result)}"]
+    parts += [_wrapped(f"  reason: {brief(reason)}") for reason in result["reasons"][:4]]
     rows = []
-    for p in result.get("parameters", []):
+    parameters = result.get("parameters", [])
+    for p, name in zip(parameters, brief_names([p["name"] for p in parameters]), strict=True):
         digits = digits_for(p["q05"], p["q95"]) if p.get("q05") is not None else 4
         quantiles = [engineering(p[q], p["unit"], digits) if p.get(q) is not None else "-" for q in ("q05", "q50", "q95")]
         fitted = engineering(p["fit"], p["unit"], digits) if p["fit"] is not None else "-"
-        rows.append([p["name"], fitted, *quantiles, "" if p.get("identifiable", True) else "not identifiable"])
+        rows.append([name, fitted, *quantiles, "" if p.get("identifiable", True) else "not identifiable"])
     if rows:
         shown = rows[:16] + ([[f"... {len(rows) - 16} more in result.json", "", "", "", "", ""]] if len(rows) > 16 else [])
         parts.append("\n" + columns(["parameter", "fit", "5 %", "50 %", "95 %", ""], shown, right=(1, 2, 3, 4)))

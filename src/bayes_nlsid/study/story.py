@@ -5,16 +5,49 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayes_nlsid.study.axes import digits_for, engineering
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, places
 from bayes_nlsid.study.schema import Study
 
 STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not converged", "not_identifiable": "refused: not identifiable",
                 "failed": "refused: the computation failed"}
 
 
+TOO_FEW = 0.75  # of the samples that a 90 % band should cover: fewer is no chance, the model is inadequate
+
+
+def missed(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Held-out records of which far fewer than 90 % of the samples lie inside the 90 % band of the posterior."""
+    if not any("identifiable" in p for p in result.get("parameters", [])):
+        return []
+    each = (result.get("heldout") or {}).get("each") or []
+    return [e for e in each if e.get("coverage90") is not None and e["coverage90"] < TOO_FEW]
+
+
+def sound(result: Mapping[str, Any]) -> bool:
+    """Whether the run ended well and nothing it was tested on contradicts its intervals."""
+    return bool(result["status"] == "ok" and not missed(result))
+
+
+def status_words(result: Mapping[str, Any]) -> str:
+    """The outcome in a few words; a run that is done but misses its held-out records is not called just done."""
+    said = STATUS_WORDS[result["status"]]
+    if result["status"] != "ok" or not missed(result):
+        return said
+    return f"{said}, but the model is inadequate: {_covered(result)}"
+
+
+def _covered(result: Mapping[str, Any]) -> str:
+    """``the 90 % band covers 4 % of record “late decay”``."""
+    found = missed(result)
+    named = [f"{100 * e['coverage90']:.0f} % of record “{e['record']}”" for e in found[:3]]
+    rest = f" and too little of {len(found) - 3} more" if len(found) > 3 else ""
+    return f"the 90 % band covers {', '.join(named)}{rest}"
+
+
 def story(study: Study, result: Mapping[str, Any]) -> list[str]:
     """A handful of sentences, each from ``result.json`` alone."""
-    out = [s for s in (_found(result), _against_alternatives(result), _sure(result), _backbone(result), _heldout(result)) if s]
+    tellers = (_found, _against_alternatives, _sure, _backbone, _heldout, _inadequate)
+    out = [sentence for sentence in (tell(result) for tell in tellers) if sentence]
     out += list(study.report.notes)
     return [*out, _next(result)]
 
@@ -29,7 +62,7 @@ def _found(result: Mapping[str, Any]) -> str:
     if not chosen["terms"]:
         return ("No force law of the library explains more than the linear model does; the structure is linear as far as these "
                 "recordings can tell.")
-    terms = " and ".join(f"{t['name']} at {', '.join(t['locations'])}" for t in chosen["terms"])
+    terms = " and ".join(f"{t['name']} at {places(t['locations'])}" for t in chosen["terms"])
     share = 100 * (1 - score["mse"] / score["mse_linear"]) if score["mse_linear"] else 0.0
     verb = "was" if len(chosen["terms"]) == 1 else "were"
     way = f"{verb} chosen from the library" if chosen["forward"] else f"{verb} given as the form"
@@ -51,12 +84,13 @@ def _sure(result: Mapping[str, Any]) -> str:
     if not rows:
         return "No posterior was computed, so these are best values without uncertainty." if result.get("parameters") else ""
     tight = [p for p in rows if p["identifiable"]]
-    loose = [p["name"] for p in rows if not p["identifiable"]]
+    short = dict(zip([p["name"] for p in rows], brief_names([p["name"] for p in rows]), strict=True))
+    loose = [short[p["name"]] for p in rows if not p["identifiable"]]
     said = f"The recordings determine {len(tight)} of {len(rows)} parameters"
     if tight and tight[0]["q50"] is not None:
         best = min(tight, key=lambda p: p.get("narrowing", 1.0))
         low, middle, high = (engineering(best[q], best["unit"], digits_for(best["q05"], best["q95"])) for q in ("q05", "q50", "q95"))
-        said += f", best {best['name']}: {middle}, 90 % between {low} and {high}"
+        said += f", best {short[best['name']]}: {middle}, 90 % between {low} and {high}"
     return said + (f"; not determined are {', '.join(loose[:6])}{' and others' if len(loose) > 6 else ''}." if loose else ".")
 
 
@@ -82,17 +116,29 @@ def _heldout(result: Mapping[str, Any]) -> str:
             f"{100 * h['noise_floor']:.2g} %), and {100 * h['coverage90']:.0f} % of the samples lie inside the 90 % band.")
 
 
+def _inadequate(result: Mapping[str, Any]) -> str:
+    """That intervals of a model which its own test contradicts are conditional on that model."""
+    if result["status"] == "failed" or not missed(result):
+        return ""
+    worst = min(missed(result), key=lambda e: float(e["coverage90"]))
+    error = f", where it errs by {100 * worst['nrmse']:.3g} %"
+    error += f", {worst['nrmse'] / worst['noise_floor']:.3g} times the sensor noise" if worst.get("noise_floor") else ""
+    return (f"All intervals given here are conditional on an inadequate model: {_covered(result)}{error}. They tell how closely the "
+            "recordings fix the parameters of this model, not how far it is from the structure; the truth may lie far outside them.")
+
+
 def _next(result: Mapping[str, Any]) -> str:
     """What a person should do now."""
     status = result["status"]
     if status == "failed":
-        return f"Next: the computation failed ({'; '.join(result['reasons'][:2])}); look at run.log and widen or correct what it names."
+        why = "; ".join(map(brief, result["reasons"][:2]))
+        return f"Next: the computation failed ({why}); look at run.log and widen or correct what it names."
     if status == "not_converged":
         return "Next: do not use the intervals yet; raise steps under [posterior] and run again, the sampler goes on from where it stopped."
     if status == "not_identifiable":
         return "Next: record larger amplitudes, or tie the joints' parameters, before trusting any value of the nonlinear part."
-    h, b = result.get("heldout") or {}, result.get("backbone") or {}
-    if h.get("coverage90") is not None and h["coverage90"] < 0.75:
+    b = result.get("backbone") or {}
+    if missed(result):
         return ("Next: the band is too narrow on records it has not seen, so something is missing in the model; find it with nlsid "
                 "diagnose, and do not extrapolate until then.")
     if b.get("inside_damping") is not None and min(b["inside_damping"], b["inside_frequency"]) < 0.6:
