@@ -272,6 +272,7 @@ class _Run:
         tau = max(integrated_time(half[..., i]) for i in range(half.shape[-1]))
         if (done >= LEAST_BURN and done >= BURN_TIMES * tau) or done + self.block > longest:
             self.burn_blocks = len(self.blocks)
+        elif done < BURN_TIMES * tau / 2:   # walkers that are still on their way down are not lost
             return states
         last = self.blocks[-1]
         lost = stuck(np.array([b.log_prob for b in last]), np.array([b.accepted for b in last]) / self.block, half.shape[-1])
