@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayes_nlsid.study.axes import axis_label, digits_for, engineering, prefixed, unit_sign
+from bayes_nlsid.study.axes import axis_label, brief, brief_names, digits_for, engineering, places, prefixed, unit_sign
 
 
 @pytest.mark.parametrize(("value", "unit", "text"), [
@@ -24,6 +24,89 @@ def test_prefix_is_that_of_the_largest() -> None:
     assert prefixed([5.0], "m/s^2") == (1.0, "m/s²")
     assert prefixed([np.nan, np.inf], "m") == (1.0, "m")
     assert unit_sign("N s^0.5/m^-2") == "N s⁰·⁵/m⁻²" and axis_label("chi", "") == "chi"
+
+
+def test_tied_locations_are_abbreviated() -> None:
+    tied = "iwan4_memory[J1_slip+J2_slip+J3_slip+J4_slip+J5_slip].chi"
+    assert brief(tied) == "iwan4_memory[J1_slip … J5_slip].chi"
+    assert brief(f"at a bound: {tied}, cubic[a+b+c].k") == "at a bound: iwan4_memory[J1_slip … J5_slip].chi, cubic[a … c].k"
+    for untouched in ("cubic[J1+J2].k", "f[1]", "q^2v", "a + b + c", "[1.0 + 2 + 3]"):
+        assert brief(untouched) == untouched
+    assert places(["a", "b"]) == "a, b" and places(["a", "b", "c"]) == "a … c"
+
+
+def test_abbreviated_names_stay_different() -> None:
+    names = ["cubic[a+b+d].k", "cubic[a+c+d].k", "quintic[a+b+d].k", "f[1]"]
+    assert brief_names(names) == ["cubic[a+b+d].k", "cubic[a+c+d].k", "quintic[a … d].k", "f[1]"]
+
+
+@pytest.mark.parametrize("text", ["iwan4_memory[J1_slip … J5_slip].f_s", "W" * 90, "a label of many words that nobody shortened",
+                                  "costs $5 and $6", "two\nlines of text"])
+@pytest.mark.parametrize("width", [0.8, 1.5, 4.0])
+def test_fitted_text_is_no_wider_than_asked(text: str, width: float) -> None:
+    from bayes_nlsid.study.figures import fitted, text_width
+
+    lines = fitted(text, width, 8)
+    assert text_width(lines, 8) <= width
+    kept = [c for c in text if not c.isspace()]
+    assert [c for c in lines if not c.isspace()] in (kept, [c for c in text.replace("].", "]") if not c.isspace()])
+
+
+@pytest.mark.parametrize("label", ["short", "resonance decay, read from figures of two papers, 2022", "W" * 200, "many words " * 20])
+def test_legend_stays_inside_the_figure(label: str) -> None:
+    from bayes_nlsid.study import figures as f
+
+    figure, grid = f.canvas(1, 2, height=3.0)
+    handles = [grid[0][0].plot([0, 1])[0] for _ in range(7)]
+    f.legend_below(figure, handles, [f"{k} {label}" for k in range(7)])
+    figure.canvas.draw()
+    box = figure.legends[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0
+    assert all(axes.get_window_extent().y0 > box.y1 and axes.get_window_extent().height > 1.5 * figure.dpi for axes in figure.axes)
+
+
+def test_titles_of_tied_joints_do_not_overlap() -> None:
+    from matplotlib import rc_context
+    from matplotlib.text import Text
+
+    from bayes_nlsid.study import figures_inference as i
+    from bayes_nlsid.study.figures import STYLE
+
+    names = [f"a_long_force_law[J1_slip+J2_slip+J3_slip+J4_slip].{k}" for k in ("f_s", "k_t", "chi", "beta", "x")]
+    draws = np.random.default_rng(0).standard_normal((200, 5))
+    with rc_context(STYLE):
+        figure = i.posterior_marginals(draws, names, [""] * 5, identifiable=[True, False, True, False, True])
+        figure.canvas.draw()
+    drawn = [text for axes in figure.axes[:5] for text in axes.findobj(Text) if "force_law" in text.get_text()]
+    boxes = [text.get_window_extent() for text in drawn]
+    assert len(boxes) == 5
+    assert all(not a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[k + 1:])
+    assert all(box.x1 <= figure.bbox.width and box.width > 10 for box in boxes)
+
+
+def test_energy_of_a_loop() -> None:
+    """A viscous loop c·v over a sine of amplitude X at ω loses π c ω X²; every title has three digits and the same unit."""
+    from bayes_nlsid.study import figures_prediction as p
+
+    phase = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+    c, omega = 3.0, 500.0
+    loops = [{"location": name, "term": "c", "q": size * np.sin(phase), "force": np.tile(c * size * omega * np.cos(phase), (4, 1))}
+             for name, size in (("J1", 1.5e-4), ("J2", 1.4047e-5), ("J3", 1e-8))]
+    lost = np.pi * c * omega * np.array([1.5e-4, 1.4047e-5, 1e-8]) ** 2
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in p.joint_loops(loops).axes]
+    assert f"{1e6 * lost[0]:.0f} µJ" in titles[0]
+    assert f"{1e6 * lost[1]:#.3g} µJ" in titles[1] and "e+" not in "".join(titles)
+    assert "nJ" in titles[2]
+
+
+def test_backbone_starts_where_it_can_be_compared() -> None:
+    from bayes_nlsid.study.figures_prediction import compared
+
+    a = np.geomspace(1e-7, 1e-4, 20)
+    bands = {"amplitude": a, "frequency_q50": np.where(a < 3e-7, np.nan, 80.0), "damping_q50": np.where(a < 3e-7, np.nan, 1e-3)}
+    assert compared(bands) == (a[a >= 3e-7][0], a[-1])
+    assert compared(bands, {"amplitude": np.array([2e-6, 2e-4])}) == (2e-6, 2e-4)
+    assert compared({**bands, "frequency_q50": a * np.nan, "damping_q50": a * np.nan}) == (0.0, 0.0)
 
 
 def test_digits_show_the_interval() -> None:

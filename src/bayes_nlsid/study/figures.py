@@ -59,12 +59,15 @@ def png(draw: Any, *arguments: Any, **options: Any) -> bytes:
 
 def text_width(text: str, size: float) -> float:
     """Width in inches of the widest line of a text at a font size in points, in the font of the common style."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
+    from matplotlib.font_manager import FontProperties, findfont, get_font
 
-    font = FontProperties(family=STYLE["font.family"])
-    return max(float(TextPath((0, 0), line.replace("$", r"\$"), size=size, prop=font).get_extents().x1) if line.strip() else 0.0
-               for line in text.split("\n")) / 72.0
+    font = get_font(findfont(FontProperties(family=STYLE["font.family"])))
+    font.set_size(size, 720)  # tenths of a point, so that hinting does not round the width
+    widths = [0]
+    for line in text.split("\n"):
+        font.set_text(line, 0.0)
+        widths.append(font.get_width_height()[0])
+    return max(widths) / 64 / 720
 
 
 def fitted(text: str, width: float, size: float) -> str:
@@ -108,7 +111,7 @@ def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str]) 
         wrapped = [fitted(label, share, size) for label in labels]
         if columns == 1 or all("\n" not in text for text in wrapped) or (columns == 2 and max(t.count("\n") for t in wrapped) < 2):
             break
-    legend = figure.legend(handles, wrapped, loc="outside lower center", ncols=columns, columnspacing=1.2)
+    legend = figure.legend(handles, wrapped, loc="outside lower center", ncols=columns, columnspacing=1.2, fontsize=size)
     extent = legend.get_window_extent()
     figure.set_figheight(figure.get_figheight() + float(extent.height) / figure.dpi)
 

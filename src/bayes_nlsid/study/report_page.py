@@ -43,6 +43,7 @@ code, pre { font-family: ui-monospace, Consolas, monospace; font-size: .85em; }
 pre { background: var(--tint); padding: .8rem; overflow-x: auto; border-radius: 6px; }
 details summary { cursor: pointer; color: var(--accent); overflow-wrap: anywhere; }
 p, li, figcaption { overflow-wrap: anywhere; }
+td.long { min-width: 13rem; }
 td.hash { font-family: ui-monospace, Consolas, monospace; font-size: .8em; word-break: break-all; }
 @media print {
   body { font-size: 10.5pt; } main { max-width: none; padding: 0; } nav { display: none; }
@@ -78,8 +79,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], source: str, numer
     """A table with its source below; ``numeric`` columns are set to the right. It scrolls by itself on a narrow screen."""
     if not rows:
         return ""
+    wordy = [i for i in range(len(head)) if max(len(row[i]) for row in rows) > 40]  # kept readable where the table has to scroll
+
     def mark(i: int) -> str:
-        return ' class="n"' if i in numeric else ' class="hash"' if i in hashes else ""
+        return ' class="n"' if i in numeric else ' class="hash"' if i in hashes else ' class="long"' if i in wordy else ""
     caption = f"<caption>from {escape(source)}</caption>"
     top = "".join(f"<th{mark(i) if i in numeric else ''}>{escape(text)}</th>" for i, text in enumerate(head))
     body = "".join("<tr>" + "".join(f"<td{mark(i)}>{escape(cell)}</td>" for i, cell in enumerate(row)) + "</tr>" for row in rows)
