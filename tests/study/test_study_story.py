@@ -34,7 +34,7 @@ def test_missed_records_are_said_with_numbers() -> None:
     found = result(0.04)
     words = told(found)
     assert "conditional on an inadequate model" in words and "covers 4 % of record “late”" in words
-    assert "errs by 12 %, 120 times the sensor noise" in words
+    assert "on “late” the model errs by 12 %, 120 times the sensor noise" in words
     assert "inadequate" in status_words(found) and "4 %" in status_words(found) and not sound(found)
     assert "inadequate" in summary(found, Path("nowhere")).splitlines()[0]
 

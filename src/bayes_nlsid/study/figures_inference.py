@@ -112,10 +112,8 @@ def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str]
         axes.hist(values, bins=bins, density=True, color=BLUE, alpha=0.75, label="posterior")
         if prior is not None:
             inside = factor * prior[:, i]
-            share = np.mean((inside >= span[0]) & (inside <= span[1]))
-            height = share / (span[1] - span[0]) if share > 0 else 0.0
             axes.hist(inside, bins=bins, weights=np.full(len(inside), 1 / (len(inside) * (bins[1] - bins[0]))), histtype="step", color=GREY,
-                      linestyle="--", linewidth=1.1, label="prior" if height else "prior (outside)")
+                      linestyle="--", linewidth=1.1, label="prior")
         axes.axvspan(low, high, color=BLUE, alpha=0.10, linewidth=0, label="90 % interval")
         if fit is not None:
             axes.axvline(factor * fit[i], color=RED, linewidth=1.2, label="least squares")

@@ -121,7 +121,7 @@ def _inadequate(result: Mapping[str, Any]) -> str:
     if result["status"] == "failed" or not missed(result):
         return ""
     worst = min(missed(result), key=lambda e: float(e["coverage90"]))
-    error = f", where it errs by {100 * worst['nrmse']:.3g} %"
+    error = f"; on “{worst['record']}” the model errs by {100 * worst['nrmse']:.3g} %"
     error += f", {worst['nrmse'] / worst['noise_floor']:.3g} times the sensor noise" if worst.get("noise_floor") else ""
     return (f"All intervals given here are conditional on an inadequate model: {_covered(result)}{error}. They tell how closely the "
             "recordings fix the parameters of this model, not how far it is from the structure; the truth may lie far outside them.")
