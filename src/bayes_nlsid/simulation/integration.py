@@ -22,7 +22,7 @@ BLOCK_BYTES = 2**25
 LONG_RUN = 100_000
 """Steps of numpy (each at the price of one small batch) beyond which the compiled loop is worth loading."""
 LOOP_PRICE = 10
-"""Price of a numpy step with memory in a joint over one without."""
+"""Price of a numpy step of one joint with memory, in steps of a model without."""
 EVEN_BATCH = 50
 """Samples at which a numpy step costs twice that of one sample."""
 
@@ -107,7 +107,7 @@ def simulate(model: Model, theta: ArrayLike, *, fs: float, samples: int, force: 
     coefficients = steps(omega[0], zeta[0], 1 / fs, scheme, alpha) if same else steps(omega, zeta, 1 / fs, scheme, alpha)
     first = coefficients if same else steps(omega[0], zeta[0], 1 / fs, scheme, alpha)
     period_error, false_damping = spectrum(first, omega[0], zeta[0])
-    price = LOOP_PRICE if any(element.term.memory != "none" for element in model.elements) else 1
+    price = 1 + LOOP_PRICE * sum(len(element.locations) for element in model.elements if element.term.memory != "none")
     wanted = compiled if compiled is not None else samples * price * (1 + len(omega) / EVEN_BATCH) > LONG_RUN
     stepper, ran = _stepper(request, coefficients, omega[:1] if same else omega, zeta[:1] if same else zeta, progress if wanted else None,
                             wanted)
