@@ -13,7 +13,7 @@ from bayes_nlsid.forces.motion import Motion, force_along, motion
 from bayes_nlsid.forces.term import Term
 from bayes_nlsid.identification.scenario import Scenario
 from bayes_nlsid.identification.spectrum import Spectrum
-from bayes_nlsid.identification.table import ForceTable, build, symmetry_of
+from bayes_nlsid.identification.table import ForceTable, Symmetry, build, symmetry_of
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 
 BLOCK = 2_000_000  # samples of force held at once, about 16 MB per array
@@ -70,6 +70,7 @@ class Observed:
     record: NDArray[np.intp] = field(init=False, repr=False)
     linear_force: NDArray[np.float64] = field(init=False, repr=False)
     _motions: dict[tuple[int, str, bool], Motion] = field(init=False, repr=False, default_factory=dict)
+    _kinds: dict[tuple[str, str], Symmetry | None] = field(init=False, repr=False, default_factory=dict)
     _tables: dict[tuple[tuple[str, ...], str, str, int], ForceTable] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -180,7 +181,7 @@ class Observed:
         def exact(law: Term, values: ArrayLike, spring_off: bool) -> NDArray[np.float64]:
             return np.asarray(sum(self._exact_force(law, name, values, spring_off) for name in locations))
 
-        kind = symmetry_of(term, 1.0) if places else None
+        kind = self._kind(term) if places else None
         if kind is None:
             return exact(term, p, excess)
         key = (tuple(locations), term.memory, kind, places)
@@ -189,6 +190,13 @@ class Observed:
             reach = max(float(np.max(np.abs(self.path(r, name)[0]))) for r in range(len(self.data)) for name in locations)
             self._tables[key] = build(lambda t, x: exact(t, x, False), term.memory, kind, reach, places)
         return self._tables[key].force(term, p, excess)
+
+    def _kind(self, term: Term) -> Symmetry | None:
+        """What table the law allows, found out once for each law: it takes thousands of evaluations of it."""
+        key = (term.name, term.formula)
+        if key not in self._kinds:
+            self._kinds[key] = symmetry_of(term, 1.0)
+        return self._kinds[key]
 
     def _exact_force(self, term: Term, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:
         values = np.asarray(p, dtype=float)
