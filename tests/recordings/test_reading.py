@@ -284,7 +284,7 @@ def test_damaged_matlab_files_raise_input_errors_only(tmp_path: Path, name: str,
 def test_a_parser_that_crashes_is_an_unreadable_file(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     crash = tmp_path / "crash.py"
     crash.write_text("import os\nos.abort()\n")
-    monkeypatch.setattr(readers, "MATLAB_PARSER", crash)
+    monkeypatch.setattr(readers, "PARSER", crash)
     with pytest.raises(InputError, match="its structure is broken"):
         read_file(write("a.mat", mat_bytes()))
 

@@ -1,4 +1,4 @@
-"""Files to named arrays: npz, delimited text, and MATLAB, each read from the bytes whose hash is kept.
+"""Files to named arrays: npz, text, MATLAB, HDF5, universal files and TDMS, each read from the bytes whose hash is kept.
 
 A damaged, foreign, pickled or oversized file is bad input, whatever the parser beneath makes of it: only `InputError` leaves here.
 """
@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import re
-import subprocess
-import sys
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.recordings.isolation import Unreadable, parse_apart
+from bayes_nlsid.recordings.units import is_unit
 
 MAX_BYTES = 2**30  # of a file, and of what it unpacks to
-PATIENCE = 600.0  # s that a MATLAB file may take
-MATLAB_PARSER = Path(__file__).with_name("matlab.py")
+PARSER = Path(__file__).with_name("foreign.py")
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -42,12 +43,25 @@ class Contents:
         Units found beside the names, if any.
     sha256 : str
         Of the bytes that were parsed.
+    quantities : dict of str to str
+        What an array measures, where the file says so.
     """
 
     path: str
     arrays: Arrays
     units: Mapping[str, str]
     sha256: str
+    quantities: Mapping[str, str] = field(default_factory=dict)
+
+
+@final
+@dataclass(frozen=True)
+class Parsed:
+    """What a reader makes of the bytes of a file."""
+
+    arrays: Arrays
+    units: Mapping[str, str] = field(default_factory=dict)
+    quantities: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_file(path: str | Path) -> Contents:
@@ -78,30 +92,25 @@ def read_file(path: str | Path) -> Contents:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            arrays, units = reader(data)
-    except _Refused as error:
-        raise InputError(str(file), error.args[0], error.args[1]) from error
+            found = reader(data)
+    except Unreadable as error:
+        raise InputError(str(file), error.problem, error.mend) from error
     except Exception as error:  # the parsers document no closed set of exceptions for damaged files
         detail = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(str(file), f"cannot be read as {file.suffix.lower()} ({detail})",
                          "it is damaged, cut short or of another kind: export it again") from error
-    if not arrays:
+    if not found.arrays:
         raise InputError(str(file), "holds no numeric array", "export the recording again")
-    return Contents(str(file), arrays, units, hashlib.sha256(data).hexdigest())
-
-
-@final
-class _Refused(Exception):
-    """Problem and mend, from a reader that does not know the name of its file."""
+    return Contents(str(file), found.arrays, found.units, hashlib.sha256(data).hexdigest(), found.quantities)
 
 
 # ---------------------------------------------------------------------------------------------------------------------- npz
 
-def _read_npz(data: bytes) -> tuple[Arrays, dict[str, str]]:
+def _read_npz(data: bytes) -> Parsed:
     """Arrays of an npz archive; declared sizes are checked against the archive before anything is unpacked."""
     arrays: Arrays = {}
     if not zipfile.is_zipfile(io.BytesIO(data)):
-        raise _Refused("is not an npz archive", "it is cut short or of another kind: save it with numpy.savez")
+        raise Unreadable("is not an npz archive", "it is cut short or of another kind: save it with numpy.savez")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
         _check_unpacked(sum(m.file_size for m in members))
@@ -112,19 +121,19 @@ def _read_npz(data: bytes) -> tuple[Arrays, dict[str, str]]:
                 shape, fortran, dtype = read(stream)
                 name = member.filename.removesuffix(".npy")
                 if dtype.hasobject:
-                    raise _Refused(f"array {name!r} holds pickled Python objects, which are never loaded", "save plain numeric arrays")
+                    raise Unreadable(f"array {name!r} holds pickled Python objects, which are never loaded", "save plain numeric arrays")
                 count = int(np.prod([int(i) for i in shape], dtype=object)) if shape else 1
                 if count * dtype.itemsize > member.file_size:
-                    raise _Refused(f"array {name!r} is cut short", "save the file again")
+                    raise Unreadable(f"array {name!r} is cut short", "save the file again")
                 if dtype.kind in "fiub":
                     values = np.frombuffer(stream.read(count * dtype.itemsize), dtype=dtype, count=count)
                     arrays[name] = values.reshape(shape, order="F" if fortran else "C")
-    return arrays, {}
+    return Parsed(arrays)
 
 
 def _check_unpacked(size: int) -> None:
     if size > MAX_BYTES:
-        raise _Refused(f"unpacks to {size / 2**20:.0f} MiB, more than the {MAX_BYTES / 2**20:.0f} MiB that are read at once",
+        raise Unreadable(f"unpacks to {size / 2**20:.0f} MiB, more than the {MAX_BYTES / 2**20:.0f} MiB that are read at once",
                        "cut it into shorter recordings")
 
 
@@ -135,26 +144,26 @@ _COMMENT = ("#", "%", "//", "!")
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
-def _read_text(data: bytes) -> tuple[Arrays, dict[str, str]]:
+def _read_text(data: bytes) -> Parsed:
     """Columns of delimited text under a header row; units may follow the names in brackets."""
     if b"\0" in data[:4096] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise _Refused("is not text", "give the suffix that belongs to the file")
+        raise Unreadable("is not text", "give the suffix that belongs to the file")
     lines, numbers = _lines(data)
     if len(lines) < 2:
-        raise _Refused("holds no header row followed by numbers", "write the names of the columns in the first row")
+        raise Unreadable("holds no header row followed by numbers", "write the names of the columns in the first row")
     separator = next((s for s in ("\t", ";", ",") if s in lines[0]), None)
     header = [_NAME.fullmatch(cell.strip().strip('"')) for cell in _cells(lines[0], separator)]
     names = [m.group(1).strip('"') if m else "" for m in header]
     if any(_number(cell) is not None for cell in _cells(lines[0], separator)):
-        raise _Refused("has no header row", "write the names of the columns in the first row")
+        raise Unreadable("has no header row", "write the names of the columns in the first row")
     if len(set(names)) != len(names):
-        raise _Refused(f"repeats the column name {next(n for n in names if names.count(n) > 1)!r}", "give every column its own name")
+        raise Unreadable(f"repeats the column name {next(n for n in names if names.count(n) > 1)!r}", "give every column its own name")
     rows = lines[1:]
     if separator != "," and not any("." in row for row in rows[:100]) and any("," in row for row in rows):
         rows = [row.replace(",", ".") for row in rows]
     table = _table(rows, numbers[1:], separator, len(names))
     units = {name: m.group(2).strip() for name, m in zip(names, header, strict=True) if m is not None and m.group(2)}
-    return {name: table[:, i] for i, name in enumerate(names) if name}, units
+    return Parsed({name: table[:, i] for i, name in enumerate(names) if name}, units)
 
 
 def _lines(data: bytes) -> tuple[list[str], list[int]]:
@@ -203,37 +212,36 @@ def _table(rows: list[str], numbers: list[int], separator: str | None, width: in
         if len(cells) == width + 1 and not cells[-1].strip():
             cells = cells[:-1]
         if len(cells) != width:
-            raise _Refused(f"line {number} has {len(cells)} cells, the header {width}", "mend that line, or export the file again")
+            raise Unreadable(f"line {number} has {len(cells)} cells, the header {width}", "mend that line, or export the file again")
         for j, cell in enumerate(cells):
             text = cell.strip().strip('"').lower()
             try:
                 out[i, j] = np.nan if text in _MISSING else float(text)
             except ValueError:
-                raise _Refused(f"line {number}, column {j + 1} is no number: {cell.strip()[:30]!r}",
+                raise Unreadable(f"line {number}, column {j + 1} is no number: {cell.strip()[:30]!r}",
                                "mend that cell, or leave it empty and choose a window without it") from None
     return out
 
 
-# ------------------------------------------------------------------------------------------------------------------- MATLAB
+# --------------------------------------------------------------------------------------- MATLAB, HDF5, TDMS, universal files
 
-def _read_mat(data: bytes) -> tuple[Arrays, dict[str, str]]:
-    """Arrays of a MATLAB file of any version; fields of structs under dotted names.
-
-    The parsers beneath are compiled code that a damaged file can crash. They run in a process of their own, whose end by a signal is
-    then only one more way of being unreadable.
-    """
-    try:
-        done = subprocess.run([sys.executable, "-P", str(MATLAB_PARSER), str(MAX_BYTES)], input=data, capture_output=True, check=False,
-                              timeout=PATIENCE)
-    except subprocess.TimeoutExpired:
-        raise _Refused(f"was not read within {PATIENCE:.0f} s", "cut it into shorter recordings") from None
-    if done.returncode == 0:
-        return _read_npz(done.stdout)
-    if done.returncode == 3:  # the parser says in words what is wrong
-        raise ValueError(done.stdout.decode(errors="replace"))
-    raise ValueError("its structure is broken")
+def _read_foreign(kind: str, data: bytes) -> Parsed:
+    """Arrays of a file whose parser is compiled code that a damaged file can crash: it runs in a process of its own."""
+    archive = parse_apart(PARSER, (kind, str(MAX_BYTES)), data, MAX_BYTES)
+    with zipfile.ZipFile(io.BytesIO(archive)) as opened:
+        units = json.loads(opened.read("labels.json"))
+    return Parsed(_read_npz(archive).arrays, {name: unit for name, unit in units.items() if is_unit(unit)})
 
 
-READERS: dict[str, Callable[[bytes], tuple[Arrays, dict[str, str]]]] = {
-    ".npz": _read_npz, ".csv": _read_text, ".txt": _read_text, ".tsv": _read_text, ".mat": _read_mat,
+def _read_universal(data: bytes) -> Parsed:
+    from bayes_nlsid.recordings.universal import read_universal
+
+    arrays, units, quantities = read_universal(data)
+    return Parsed(arrays, {name: unit for name, unit in units.items() if is_unit(unit)}, quantities)
+
+
+_HDF5, _MATLAB, _TDMS = (partial(_read_foreign, kind) for kind in ("hdf5", "mat", "tdms"))
+READERS: dict[str, Callable[[bytes], Parsed]] = {
+    ".npz": _read_npz, ".csv": _read_text, ".txt": _read_text, ".tsv": _read_text, ".mat": _MATLAB, ".h5": _HDF5, ".hdf5": _HDF5,
+    ".uff": _read_universal, ".unv": _read_universal, ".uf": _read_universal, ".tdms": _TDMS,
 }

@@ -83,6 +83,12 @@ def unit_factor(unit: str, quantity: str) -> float:
     return factor
 
 
+def is_unit(text: str) -> bool:
+    """Whether a label is a unit of some quantity of a test."""
+    found = _parse(text) if isinstance(text, str) else None
+    return found is not None and found[1] in _DIMENSION.values()
+
+
 def to_si(values: ArrayLike, unit: str, quantity: str) -> NDArray[np.float64]:
     """Values in SI.
 

@@ -118,7 +118,7 @@ def _read_recording(table: Table, earlier: Sequence[RecordingSpec], locations: S
     name = table.text("name", file.stem)
     role = table.text("role", "train", ROLES)
     rate, time = _read_clock(table, base)
-    time_unit = table.text("time_unit", base.time_unit if base else "s")
+    time_unit = table.text("time_unit", base.time_unit if base else "")
     period = table.integer("period", None, low=2)
     start = table.number("start", "time", base.start if base else None)
     window = table.span("window", "time", base.window if base else None)
@@ -151,16 +151,17 @@ def _read_clock(table: Table, base: RecordingSpec | None) -> tuple[float | str |
 
 
 def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
-    quantity, unit = table.text("quantity", choices=QUANTITIES), table.text("unit")
+    quantity, unit = table.text("quantity", choices=QUANTITIES), table.text("unit", "")  # empty: the one written in the file, if any
     per_volt = table.number("per_volt", default=None)
     volts = unit.strip().endswith("V")
     if volts and per_volt is None:
         raise table.wrong("unit", f"{unit!r} is a voltage and the quantity is {quantity}",
                           "add per_volt = ... , what one volt stands for in SI, or give the unit of the quantity")
-    if per_volt is not None and not volts:
+    if per_volt is not None and unit and not volts:
         raise table.wrong("per_volt", f"is given beside unit {unit!r}", "give unit V or mV, or drop per_volt")
     try:
-        unit_factor(unit, "voltage" if volts else quantity)
+        if unit:
+            unit_factor(unit, "voltage" if volts else quantity)
     except InputError as error:
         raise table.wrong("unit", f"{unit!r} {error.problem}", error.mend) from None
     location = table.text("location")

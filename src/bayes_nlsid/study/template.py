@@ -42,7 +42,7 @@ location = "x"                    # name of its one motion
 
 [[recordings]]
 name = "multisine"
-file = "recording.npz"            # npz, csv or mat
+file = "recording.npz"            # npz, csv, txt, tsv, mat, h5, hdf5, uff, unv or tdms
 rate = "fs"                       # Hz, or the name of the array that holds it; or time = "name of the time array"
 role = "train"                    # "train", "holdout" (for judging only), "linear" (low level, for modes), "noise" (excitation off)
 window = [0.0, 8.0]               # s from the first sample
