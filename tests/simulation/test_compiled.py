@@ -65,7 +65,7 @@ def test_power_without_a_call_is_the_power() -> None:
     from bayes_nlsid.simulation.compiled import power_of
 
     rng = np.random.default_rng(2)
-    r: NDArray[np.float64] = np.concatenate([10 ** rng.uniform(-30, 0, 4000), [1e-300, 1.0, 0.5, np.nextafter(1, 0)]])
+    r: NDArray[np.float64] = np.concatenate([10 ** rng.uniform(-30, 0, 4000), [1e-300, 1.0, 0.5, np.nextafter(1, 0)] * 2])
     m = rng.uniform(0, 2, len(r))
     out = np.empty_like(r)
     power_of(r, m, out)

@@ -1,7 +1,7 @@
-"""Compiled forces of all elements for samples side by side in lanes; the loop over them stands in ``compiled_loop.py``.
+"""Compiled forces of all elements for eight samples side by side; the loop over them stands in ``compiled_loop.py``.
 
-Import this module only where compiled code is about to run: it imports numba. Arrays end in the lane axis; what each means stands in
-``lanes.py``.
+Import this module only where compiled code is about to run: it imports numba. All numbers of a block stand in one array ``w`` (rows, 8),
+and ``at`` says which row is what (``lanes.py``): handing many arrays from function to function would cost more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -15,15 +15,17 @@ from typing import Any
 
 import numba
 import numba.core.config
-import numba.extending
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import types
 
 from bayes_nlsid.forces import compiled as forces
-from bayes_nlsid.simulation.lanes import Elements, Memory
+from bayes_nlsid.simulation.lanes import At, Walks
+from bayes_nlsid.simulation.vector import WIDTH, choose, lanes_of, larger, load, power, signed, size, smaller, spread, store
 
 STATIC, MASING, SLIDERS, BOUC_WEN = 0, 1, 2, 3
+ALL = 2**WIDTH - 1
+"""Every lane, as bits."""
+KIND, CODE, ROW, QUICK, SLOT = range(5)
+"""Columns of ``Walks.table``."""
 law_value, masing_walk, sliders_walk, bouc_wen_walk = forces.law_value, forces.masing_walk, forces.sliders_walk, forces.bouc_wen_walk
 
 
@@ -33,7 +35,7 @@ def _cache_directory(function: Callable[..., Any]) -> str:
     if not base:
         return ""
     digest = hashlib.sha256()
-    for name in ("compiled.py", "compiled_loop.py", "lanes.py", "stepping.py"):
+    for name in ("compiled.py", "compiled_loop.py", "lanes.py", "stepping.py", "vector.py"):
         digest.update((Path(__file__).parent / name).read_bytes())
     directory = Path(base) / digest.hexdigest()[:16]
     try:
@@ -44,12 +46,16 @@ def _cache_directory(function: Callable[..., Any]) -> str:
 
 
 def kernel(function: Callable[..., Any], **more: Any) -> Any:
-    """The function compiled with fused multiply-add, kept on disk where a directory can be written."""
+    """The function compiled with fused multiply-add, kept on disk where a directory can be written.
+
+    Nothing here makes arrays, so references are not counted: that would cost a third of a step.
+    """
     directory = _cache_directory(function)
     config: Any = numba.core.config
+    njit: Any = numba.njit
     before, config.CACHE_DIR = config.CACHE_DIR, directory
     try:
-        return numba.njit(cache=bool(directory), error_model="numpy", fastmath={"contract"}, nogil=True, **more)(function)
+        return njit(cache=bool(directory), error_model="numpy", fastmath={"contract"}, nogil=True, _nrt=False, **more)(function)
     finally:
         config.CACHE_DIR = before
 
@@ -59,174 +65,149 @@ def inner(function: Callable[..., Any]) -> Any:
     return kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-_intrinsic: Any = numba.extending.intrinsic
-
-
-@_intrinsic
-def _bits(context: Any, value: Any) -> Any:
-    """The 64 bits of a number as an integer."""
-    return types.int64(types.float64), lambda c, builder, signature, args: builder.bitcast(args[0], ir.IntType(64))
-
-
-@_intrinsic
-def _number(context: Any, value: Any) -> Any:
-    """The number with these 64 bits."""
-    return types.float64(types.int64), lambda c, builder, signature, args: builder.bitcast(args[0], ir.DoubleType())
-
-
-@numba.extending.register_jitable
-def _power(r: float, m: float) -> float:
-    """r^m for 1e-300 ≤ r ≤ 2 and m ≥ 0 without a call, so that a loop over lanes becomes vector code; relative error below 2e-13."""
-    bits = _bits(r)
-    # mantissa between sqrt(1/2) and sqrt(2), log2 by the series of artanh
-    exponent = ((bits + (0x3FF0000000000000 - 0x3FE6A09E667F3BCD)) >> 52) & 0xFFF
-    whole = _number(exponent | 0x4330000000000000) - (4503599627370496.0 + 1023.0)
-    mantissa = _number(bits - ((exponent - 1023) << 52))
-    s = (mantissa - 1.0) / (mantissa + 1.0)
-    z = s * s
-    series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * (1 / 9 + z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z / 17)))))))
-    x = max(m * (whole + s * series * 2.8853900817779268), -1000.0)
-    # adding 1.5 * 2^52 rounds to an integer and leaves it in the low bits
-    shifted = x + 6755399441055744.0
-    t = (x - (shifted - 6755399441055744.0)) * 0.6931471805599453
-    e = 1.0 + t * (1.0 + t * (1 / 2 + t * (1 / 6 + t * (1 / 24 + t * (1 / 120 + t * (1 / 720 + t * (1 / 5040 + t * (1 / 40320 + t * (
-        1 / 362880 + t * (1 / 3628800 + t * (1 / 39916800 + t / 479001600)))))))))))
-    return _number(_bits(e) + (_bits(shifted) << 52))
+def inline(function: Callable[..., Any]) -> Any:
+    """As ``inner``, copied into every caller: for what runs in every step."""
+    return kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
 
 
 @kernel
 def power_of(r: np.ndarray, m: np.ndarray, out: np.ndarray) -> None:
-    """Element by element r^m, for tests."""
-    for i in range(len(r)):
-        out[i] = _power(r[i], m[i])
+    """Element by element r^m, for tests; lengths are multiples of eight."""
+    for i in range(len(r) // WIDTH):
+        store(out, i, power(load(r, i), load(m, i)))
 
 
 # --- forces -------------------------------------------------------------------------------------------------------------------
 
 
-@inner
-def _iwan(e: int, c: np.ndarray, x: np.ndarray, bent: np.ndarray, f: np.ndarray, slope: np.ndarray) -> None:
-    """Backbone and slope of four- and five-parameter Iwan laws in lanes; c (E, 5, lanes): k_t, share, exponent, 1/phi_max, sliding force.
-
-    Three short loops: one with all these arrays would need more checks for overlap than the compiler is willing to make.
-    """
-    for n in range(len(x)):
-        bent[n] = c[e, 1, n] * _power(min(max(abs(x[n]) * c[e, 3, n], 1e-300), 1.0), c[e, 2, n])
-    for n in range(len(x)):
-        f[n] = c[e, 0, n] * x[n] * (1.0 - bent[n]) if abs(x[n]) * c[e, 3, n] < 1.0 else math.copysign(c[e, 4, n], x[n])
-    for n in range(len(x)):
-        slope[n] = c[e, 0, n] * (1.0 - (c[e, 2, n] + 1.0) * bent[n]) if abs(x[n]) * c[e, 3, n] < 1.0 else 0.0
+@inline
+def _iwan(w: np.ndarray, c: int, x: Any) -> tuple[Any, Any]:
+    """Backbone and slope of four- and five-parameter Iwan laws; rows c to c + 4: k_t, share, exponent, 1/phi_max, sliding force."""
+    stiffness, exponent = load(w, c), load(w, c + 2)
+    r = size(x) * load(w, c + 3)
+    bent = load(w, c + 1) * power(smaller(larger(r, spread(1e-300)), spread(1.0)), exponent)
+    sticks = r < 1.0
+    force = choose(sticks, stiffness * x * (1.0 - bent), signed(load(w, c + 4), x))
+    return force, choose(sticks, stiffness * (1.0 - (exponent + 1.0) * bent), spread(0.0))
 
 
 @inner
-def one_entry(el: Elements, mem: Memory, e: int, n: int, q: float, v: float, writing: float) -> tuple[float, float, float]:
+def one_entry(at: At, w: np.ndarray, walks: Walks, e: int, n: int, q: float, v: float, writing: float) -> tuple[float, float, float]:
     """Force and slopes of one entry in one lane by the scalar blocks; with ``writing`` > 0 the history goes on to here.
 
     ``writing`` is no bool because numba compiles a function anew for each constant bool.
     """
-    kind, fv, write = el.kind[e], 0.0, writing > 0.0
-    last = np.empty(4)
-    for i in range(4):
-        last[i] = mem.last[i, e, n]
+    kind, code, power_ = walks.table[e, KIND], walks.table[e, CODE], walks.power[e]
+    p, fv, write = walks.p[e, n], 0.0, writing > 0.0
+    spring = w[at.spring + e, n]
     if kind == STATIC:
-        f, fq, fv = law_value(el.code[e], el.power[e], q, v, el.p[e, n])
-    elif kind == MASING:
-        origin, base, doubled = mem.origin[e, n], mem.base[e, n], 1.0 / mem.half[e, n]
+        f, fq, fv = law_value(code, power_, q, v, p)
+        return f - spring * q, fq - spring, fv
+    last = walks.work[0]
+    for i in range(4):
+        last[i] = w[at.last + i * at.entries + e, n]
+    if kind == MASING:
+        ends, forces = walks.ends[e, n], walks.forces[e, n]
+        doubled = 1.0 / w[at.half + e, n]
         # the force at the last instant is only looked up at a reversal, so it is brought up to date here
-        last[2] = base + doubled * law_value(el.code[e], el.power[e], (last[0] - origin) / doubled, 0.0, el.p[e, n])[0]
-        f, fq, depth, overflow = masing_walk(el.code[e], el.power[e], el.p[e, n], last, mem.depth[e, n], mem.ends[e, n], mem.forces[e, n],
-                                             q, v, mem.dt, write)
+        last[2] = w[at.base + e, n] + doubled * law_value(code, power_, (last[0] - w[at.origin + e, n]) / doubled, 0.0, p)[0]
+        f, fq, depth, overflow = masing_walk(code, power_, p, last, walks.depth[e, n], ends, forces, q, v, walks.dt, write)
         if write:
-            mem.depth[e, n] = depth
+            walks.depth[e, n] = depth
             origin, base, half, far = 0.0, 0.0, 1.0, math.inf * last[3]
             if depth > 0:
-                origin, base, half = mem.ends[e, n, depth - 1], mem.forces[e, n, depth - 1], 0.5
-                far = mem.ends[e, n, depth - 2] if depth > 1 else -origin
-            mem.origin[e, n], mem.base[e, n], mem.half[e, n], mem.far[e, n] = origin, base, half, far
+                origin, base, half = ends[depth - 1], forces[depth - 1], 0.5
+                far = ends[depth - 2] if depth > 1 else -origin
+            w[at.origin + e, n], w[at.base + e, n], w[at.half + e, n], w[at.far + e, n] = origin, base, half, far
     elif kind == SLIDERS:
-        s = mem.slot[e]
-        f, fq = sliders_walk(mem.theta[s, n], mem.stiffness[s, n], mem.slip[s, n], last, mem.stretch[s, n], mem.sliding[s, n], q, v, mem.dt,
-                             write)
+        s = walks.table[e, SLOT]
+        f, fq = sliders_walk(walks.theta[s, n], walks.stiffness[s, n], walks.slip[s, n], last, walks.stretch[s, n],
+                             walks.sliding[s, n], q, v, walks.dt, write)
     else:
-        f, fq = bouc_wen_walk(el.p[e, n], last, q, v, mem.dt, write)
+        f, fq = bouc_wen_walk(p, last, q, v, walks.dt, write)
     if write:
         for i in range(4):
-            mem.last[i, e, n] = last[i]
-    return f - el.spring[e, n] * q, fq - el.spring[e, n], fv
+            w[at.last + i * at.entries + e, n] = last[i]
+    return f - spring * q, fq - spring, fv
+
+
+@inline
+def _on_branch(at: At, w: np.ndarray, e: int, q: Any, v: Any) -> int:
+    """Lanes, as bits, in which a Masing entry stays on its branch: no reversal, no loop closed."""
+    heading = load(w, at.last + 3 * at.entries + e)
+    ahead = heading * (q - load(w, at.last + e)) > 0.0
+    open_ = heading * (q - load(w, at.far + e)) < 0.0
+    return int(lanes_of(ahead & open_ & (load(w, at.last + at.entries + e) * v >= 0.0)))
 
 
 @inner
-def _off_branch(e: int, last: np.ndarray, far: np.ndarray, q: np.ndarray, v: np.ndarray, off: np.ndarray) -> int:
-    """Mark the lanes in which a Masing entry leaves its branch by a reversal or by closing a loop; returns how many."""
-    count = 0.0
-    for n in range(len(q)):
-        heading = last[3, e, n]
-        on = (heading * (q[n] - last[0, e, n]) > 0.0) & (heading * (q[n] - far[e, n]) < 0.0) & (last[1, e, n] * v[n] >= 0.0)
-        off[n] = 0.0 if on else 1.0
-    for n in range(len(q)):
-        count += off[n]
-    return int(count)
+def _alone(at: At, w: np.ndarray, walks: Walks, e: int, on: int, q: int, v: int) -> None:
+    """An entry's force and slopes into the spare rows, lane by lane where the bit of ``on`` is not set; q, v: rows of its motion."""
+    for n in range(at.filled):
+        if on & (1 << n) == 0:
+            w[at.spare, n], w[at.spare + 1, n], w[at.spare + 2, n] = one_entry(at, w, walks, e, n, w[q, n], w[v, n], 0.0)
+    for n in range(at.filled, WIDTH):
+        for i in range(3):
+            w[at.spare + i, n] = w[at.spare + i, at.filled - 1]
 
 
-@kernel
-def evaluate(el: Elements, mem: Memory, q: np.ndarray, v: np.ndarray, f: np.ndarray, fq: np.ndarray, fv: np.ndarray,
-              work: np.ndarray) -> None:
-    """All entries in all lanes."""
-    lanes = q.shape[1]
-    for r in range(q.shape[0]):
-        for n in range(lanes):
-            f[r, n] = 0.0
-            fq[r, n] = 0.0
-            fv[r, n] = 0.0
-    x, a, b, bent, off = work[0], work[1], work[2], work[3], work[4]
-    for e in range(len(el.kind)):
-        r = el.row[e]
-        single = lanes
-        if not el.fast[e]:
-            for n in range(lanes):
-                off[n] = 1.0
-        elif el.kind[e] == STATIC:
-            single = 0
-            _iwan(e, el.coefficient, q[r], bent, a, b)
-            for n in range(lanes):
-                a[n] -= el.spring[e, n] * q[r, n]
+@inline
+def evaluate(at: At, w: np.ndarray, walks: Walks, table: np.ndarray, q: int, v: int, f: int, fq: int, fv: int) -> None:
+    """All entries in all lanes: from the rows q, v into the rows f, fq, fv."""
+    for i in range(at.joints):
+        store(w, f + i, 0.0)
+        store(w, fq + i, 0.0)
+        store(w, fv + i, 0.0)
+    for e in range(at.entries):
+        r, on = table[e, ROW], 0
+        if table[e, QUICK]:
+            here, spring = load(w, q + r), load(w, at.spring + e)
+            if table[e, KIND] == STATIC:
+                force, slope = _iwan(w, at.coefficient + 5 * e, here)
+                on = ALL
+            else:
+                half = load(w, at.half + e)
+                force, slope = _iwan(w, at.coefficient + 5 * e, (here - load(w, at.origin + e)) * half)
+                force = load(w, at.base + e) + force * (3.0 - 2.0 * half)  # half is 1 on first loading, 1/2 afterwards
+                on = _on_branch(at, w, e, here, load(w, v + r))
+            force, slope = force - spring * here, slope - spring
+            if on != ALL:
+                store(w, at.spare, force)
+                store(w, at.spare + 1, slope)
+                store(w, at.spare + 2, 0.0)
         else:
-            for n in range(lanes):
-                x[n] = (q[r, n] - mem.origin[e, n]) * mem.half[e, n]
-            _iwan(e, el.coefficient, x, bent, a, b)
-            for n in range(lanes):
-                a[n] = mem.base[e, n] + a[n] / mem.half[e, n] - el.spring[e, n] * q[r, n]
-            single = _off_branch(e, mem.last, mem.far, q[r], v[r], off)
-        if el.fast[e]:
-            for n in range(lanes):
-                b[n] -= el.spring[e, n]
-        if single:
-            for n in range(lanes):
-                if off[n] > 0.0:
-                    a[n], b[n], slope = one_entry(el, mem, e, n, q[r, n], v[r, n], 0.0)
-                    fv[r, n] += slope
-        for n in range(lanes):
-            f[r, n] += a[n]
-        for n in range(lanes):
-            fq[r, n] += b[n]
+            force, slope = spread(0.0), spread(0.0)
+        if on != ALL:
+            _alone(at, w, walks, e, on, q + r, v + r)
+            force, slope = load(w, at.spare), load(w, at.spare + 1)
+            store(w, fv + r, load(w, fv + r) + load(w, at.spare + 2))
+        store(w, f + r, load(w, f + r) + force)
+        store(w, fq + r, load(w, fq + r) + slope)
 
 
-@kernel
-def commit(el: Elements, mem: Memory, q: np.ndarray, v: np.ndarray, off: np.ndarray) -> int:
-    """Carry the histories on; returns the deepest stack."""
-    deepest, last = 0, mem.last
-    for e in range(len(el.kind)):
-        if el.kind[e] == STATIC:
-            continue
-        r = el.row[e]
-        if el.kind[e] != MASING or _off_branch(e, last, mem.far, q[r], v[r], off):
-            for n in range(q.shape[1]):
-                if el.kind[e] != MASING or off[n] > 0.0:
-                    one_entry(el, mem, e, n, q[r, n], v[r, n], 1.0)
-                    deepest = max(deepest, mem.depth[e, n])
-        if el.kind[e] == MASING:  # harmless where the scalar step has done it already
-            for n in range(q.shape[1]):
-                last[0, e, n] = q[r, n]
-            for n in range(q.shape[1]):
-                last[1, e, n] = v[r, n]
+@inner
+def _turn(at: At, w: np.ndarray, walks: Walks, e: int, on: int, q: int, v: int) -> int:
+    """Carry an entry's history on lane by lane where the bit of ``on`` is not set; returns the deepest stack."""
+    deepest, masing = 0, walks.table[e, KIND] == MASING
+    for n in range(WIDTH):
+        # lanes that only fill the vector need no history but where they are compared with their branch
+        if on & (1 << n) == 0 and (n < at.filled or masing):
+            one_entry(at, w, walks, e, n, w[q, n], w[v, n], 1.0)
+            deepest = max(deepest, walks.depth[e, n])
+    return deepest
+
+
+@inline
+def commit(at: At, w: np.ndarray, walks: Walks, table: np.ndarray, q: int, v: int) -> int:
+    """Carry the histories on to the rows q, v; returns the deepest stack that was changed."""
+    deepest = 0
+    for e in range(at.entries):
+        kind, r = table[e, KIND], table[e, ROW]
+        if kind != STATIC:
+            on = _on_branch(at, w, e, load(w, q + r), load(w, v + r)) if kind == MASING else 0
+            if on != ALL:
+                deepest = max(deepest, _turn(at, w, walks, e, on, q + r, v + r))
+            if kind == MASING:  # harmless where the scalar step has done it already
+                store(w, at.last + e, load(w, q + r))
+                store(w, at.last + at.entries + e, load(w, v + r))
     return deepest

@@ -1,8 +1,7 @@
-"""The time loop compiled: the same scheme as ``stepping.py`` step by step, for samples side by side in lanes.
+"""The time loop compiled: the same scheme as ``stepping.py`` step by step, for eight samples side by side.
 
-Import this module only where compiled code is about to run: it brings numba with it. Arrays end in the lane axis; ``W`` is the number of
-lanes, or 1
-where all lanes share the linear part. What each array means stands in ``lanes.py``, which builds them.
+Import this module only where compiled code is about to run: it brings numba with it. All numbers of a block stand in one array ``w``
+(rows, 8), and ``at`` says which row is what, see ``lanes.py``.
 """
 
 from __future__ import annotations
@@ -14,360 +13,313 @@ from typing import Any
 
 import numpy as np
 
-from bayes_nlsid.simulation.compiled import commit, evaluate, inner, kernel, one_entry
-from bayes_nlsid.simulation.lanes import Elements, Linear, Memory, Motion
+from bayes_nlsid.simulation.compiled import ROW, commit, evaluate, inline, inner, kernel, one_entry
+from bayes_nlsid.simulation.joints import PRELOAD_STEPS
+from bayes_nlsid.simulation.lanes import At, Walks
 from bayes_nlsid.simulation.stepping import ACCEPT, CONVERGED, MOST_ITERATIONS, SMALLEST_CONTRACTION
+from bayes_nlsid.simulation.vector import WIDTH, lanes_of, larger, load, size, spread, store
 
 # --- the linear part ----------------------------------------------------------------------------------------------------------
 
 
-@inner
-def _predict(shared: bool, a: np.ndarray, old: np.ndarray, x: np.ndarray, f: np.ndarray, y: np.ndarray) -> None:
-    components, modes, lanes = x.shape
+@inline
+def _rows(b: np.ndarray, w: np.ndarray, x: int, out: np.ndarray, to: int) -> None:
+    """Rows of ``out`` from ``to`` on = b times the rows of w from x on, for a matrix that all lanes share."""
+    for r in range(b.shape[0]):
+        total = b[r, 0] * load(w, x)
+        for k in range(1, b.shape[1]):
+            total = total + b[r, k] * load(w, x + k)
+        store(out, to + r, total)
+
+
+@inline
+def _given(w: np.ndarray, s: int, r: int, g: int, joints: int) -> Any:
+    """Row r of S g."""
+    total = load(w, s + r * joints) * load(w, g)
+    for t in range(1, joints):
+        total = total + load(w, s + r * joints + t) * load(w, g + t)
+    return total
+
+
+@inline
+def _applied(force: np.ndarray, i: int, k: int) -> Any:
+    """Modal force on mode k at instant i."""
+    return spread(force[i, k, 0]) if force.shape[2] == 1 else load(force, i * force.shape[1] + k)
+
+
+@inline
+def _predict(at: At, w: np.ndarray, force: np.ndarray, i: int) -> None:
+    """Where every mode would be at the end of the step without any force of a joint there."""
+    components, modes = at.components, at.modes
     for k in range(modes):
-        for i in range(components):
-            if shared:
-                a0, a1, o = a[k, i, 0, 0], a[k, i, 1, 0], old[k, i, 0]
-                for n in range(lanes):
-                    y[i, k, n] = a0 * x[0, k, n] + a1 * x[1, k, n] + o * f[k, n]
-                if components == 3:
-                    a2 = a[k, i, 2, 0]
-                    for n in range(lanes):
-                        y[i, k, n] += a2 * x[2, k, n]
-            else:
-                for n in range(lanes):
-                    y[i, k, n] = a[k, i, 0, n] * x[0, k, n] + a[k, i, 1, n] * x[1, k, n] + old[k, i, n] * f[k, n]
-                if components == 3:
-                    for n in range(lanes):
-                        y[i, k, n] += a[k, i, 2, n] * x[2, k, n]
+        x0, x1, before = load(w, at.x + k), load(w, at.x + modes + k), load(w, at.f + k)
+        for c in range(components):
+            row = k * components + c
+            a = at.a + row * components
+            total = load(w, a) * x0 + load(w, a + 1) * x1 + load(w, at.old + row) * before
+            if components == 3:
+                total = total + load(w, a + 2) * load(w, at.x + 2 * modes + k)
+            if len(force):
+                total = total + load(w, at.new + row) * _applied(force, i, k)
+            store(w, at.y + c * modes + k, total)
 
 
-@inner
-def _push(lin: Linear, p: np.ndarray, y: np.ndarray) -> None:
-    """Add the applied modal force p (m, 1 or lanes) at the end of the step."""
-    components, modes, lanes = y.shape
+@inline
+def _correct(at: At, w: np.ndarray, b: np.ndarray, force: np.ndarray, i: int) -> None:
+    """Finish the step with the joint forces g."""
+    components, modes = at.components, at.modes
     for k in range(modes):
-        for i in range(components):
-            for n in range(lanes):
-                y[i, k, n] += lin.new[k, i, 0 if lin.shared else n] * p[k, 0 if p.shape[1] == 1 else n]
-
-
-@inner
-def _rows(b: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
-    """out = b x, five columns at a time."""
-    rows, columns = b.shape
-    lanes = out.shape[1]
-    for r in range(rows):
-        for n in range(lanes):
-            out[r, n] = 0.0
-        k = 0
-        while k + 5 <= columns:
-            b0, b1, b2, b3, b4 = b[r, k], b[r, k + 1], b[r, k + 2], b[r, k + 3], b[r, k + 4]
-            for n in range(lanes):
-                out[r, n] += b0 * x[k, n] + b1 * x[k + 1, n] + b2 * x[k + 2, n] + b3 * x[k + 3, n] + b4 * x[k + 4, n]
-            k += 5
-        while k + 2 <= columns:
-            b0, b1 = b[r, k], b[r, k + 1]
-            for n in range(lanes):
-                out[r, n] += b0 * x[k, n] + b1 * x[k + 1, n]
-            k += 2
-        if k < columns:
-            b0 = b[r, k]
-            for n in range(lanes):
-                out[r, n] += b0 * x[k, n]
-
-
-@inner
-def _give(shared: bool, s: np.ndarray, square: np.ndarray, g: np.ndarray, out: np.ndarray) -> None:
-    """out = S g."""
-    if shared:
-        _rows(square, g, out)
-        return
-    for r in range(len(s)):
-        for n in range(g.shape[1]):
-            out[r, n] = 0.0
-        for t in range(len(s)):
-            for n in range(g.shape[1]):
-                out[r, n] += s[r, t, n] * g[t, n]
-
-
-@inner
-def _moved(shared: bool, s: np.ndarray, square: np.ndarray, start: np.ndarray, g: np.ndarray, q: np.ndarray) -> None:
-    """q = start − S g."""
-    _give(shared, s, square, g, q)
-    for r in range(q.shape[0]):
-        for n in range(q.shape[1]):
-            q[r, n] = start[r, n] - q[r, n]
-
-
-@inner
-def _correct(shared: bool, new: np.ndarray, y: np.ndarray, back: np.ndarray, p: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
-    components, modes, lanes = x.shape
-    for k in range(modes):
-        for i in range(components):
-            if shared:
-                c = new[k, i, 0]
-                for n in range(lanes):
-                    x[i, k, n] = y[i, k, n] - c * back[k, n]
-            else:
-                for n in range(lanes):
-                    x[i, k, n] = y[i, k, n] - new[k, i, n] * back[k, n]
-        for n in range(lanes):
-            f[k, n] = -back[k, n]
-        if len(p):
-            for n in range(lanes):
-                f[k, n] += p[k, 0 if p.shape[1] == 1 else n]
-
-
-@inner
-def _copy(source: np.ndarray, target: np.ndarray) -> None:
-    for r in range(source.shape[0]):
-        for n in range(source.shape[1]):
-            target[r, n] = source[r, n]
+        back = spread(0.0)
+        for r in range(at.joints):
+            back = back + b[r, k] * load(w, at.g + r)
+        for c in range(components):
+            row = c * modes + k
+            store(w, at.x + row, load(w, at.y + row) - load(w, at.new + k * components + c) * back)
+        if len(force):
+            store(w, at.f + k, _applied(force, i, k) - back)
+        else:
+            store(w, at.f + k, 0.0 - back)
 
 
 # --- Newton in one lane -------------------------------------------------------------------------------------------------------
 
 
 @inner
-def _eliminate(a: np.ndarray, b: np.ndarray) -> None:
+def _eliminate(a: np.ndarray, b: np.ndarray, count: int) -> None:
     """Solve a x = b in place of b, with pivoting; a zero pivot leaves the entry as it is."""
-    size = len(b)
-    for i in range(size):
+    for i in range(count):
         best = i
-        for j in range(i + 1, size):
+        for j in range(i + 1, count):
             if abs(a[j, i]) > abs(a[best, i]):
                 best = j
         if a[best, i] == 0.0:
             continue
         if best != i:
-            for k in range(size):
+            for k in range(count):
                 a[i, k], a[best, k] = a[best, k], a[i, k]
             b[i], b[best] = b[best], b[i]
-        for j in range(i + 1, size):
+        for j in range(i + 1, count):
             factor = a[j, i] / a[i, i]
-            for k in range(i, size):
+            for k in range(i, count):
                 a[j, k] -= factor * a[i, k]
             b[j] -= factor * b[i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
             b[i] -= a[i, k] * b[k]
         if a[i, i] != 0.0:
             b[i] /= a[i, i]
 
 
 @inner
-def _residual(lin: Linear, el: Elements, mem: Memory, n: int, q0: np.ndarray, v0: np.ndarray, g: np.ndarray, at: np.ndarray) -> None:
-    """at (4, R): e = f − g, its slopes by q and v, and the force f itself, in lane n at the joint forces g (R,)."""
+def _residual(at: At, w: np.ndarray, walks: Walks, n: int, g: np.ndarray, out: np.ndarray) -> None:
+    """out (4, R): e = f − g, its slopes by q and v, and the force f itself, in lane n at the joint forces g (R,)."""
+    joints = at.joints
     for i in range(4):
-        for r in range(len(g)):
-            at[i, r] = 0.0
-    w = 0 if lin.shared else n
-    size = len(g)
-    for e in range(len(el.kind)):
-        r = el.row[e]
-        q, v = q0[r, n], v0[r, n]
-        for t in range(size):
-            q -= lin.sq[r, t, w] * g[t]
-            v -= lin.sv[r, t, w] * g[t]
-        f, fq, fv = one_entry(el, mem, e, n, q, v, 0.0)
-        at[3, r] += f
-        at[1, r] += fq
-        at[2, r] += fv
-    for r in range(size):
-        at[0, r] = at[3, r] - g[r]
+        for r in range(joints):
+            out[i, r] = 0.0
+    for e in range(at.entries):
+        r = walks.table[e, ROW]
+        q, v = w[at.q0 + r, n], w[at.v0 + r, n]
+        for t in range(joints):
+            q -= w[at.sq + r * joints + t, n] * g[t]
+            v -= w[at.sv + r * joints + t, n] * g[t]
+        f, fq, fv = one_entry(at, w, walks, e, n, q, v, 0.0)
+        out[3, r] += f
+        out[1, r] += fq
+        out[2, r] += fv
+    for r in range(joints):
+        out[0, r] = out[3, r] - g[r]
 
 
 @inner
-def _excess(lin: Linear, mot: Motion, n: int, at: np.ndarray) -> float:
-    """Largest change of q or v that e = at[0] would make, relative to the largest motion so far (R,)."""
-    w = 0 if lin.shared else n
-    worst = 0.0
-    size = at.shape[1]
-    for r in range(size):
+def _excess(at: At, w: np.ndarray, n: int, out: np.ndarray) -> float:
+    """Largest change of q or v that e = out[0] would make, relative to the largest motion so far (R,)."""
+    worst, joints = 0.0, at.joints
+    for r in range(joints):
         dq, dv = 0.0, 0.0
-        for t in range(size):
-            dq += lin.sq[r, t, w] * at[0, t]
-            dv += lin.sv[r, t, w] * at[0, t]
+        for t in range(joints):
+            dq += w[at.sq + r * joints + t, n] * out[0, t]
+            dv += w[at.sv + r * joints + t, n] * out[0, t]
         if abs(dq) > 0.0:
-            worst = max(worst, abs(dq) / max(mot.scale_q[r, n], 1e-300))
-        if lin.velocity and abs(dv) > 0.0:
-            worst = max(worst, abs(dv) / max(mot.scale_v[r, n], 1e-300))
+            worst = max(worst, abs(dq) / max(w[at.scale_q + r, n], 1e-300))
+        if at.velocity and abs(dv) > 0.0:
+            worst = max(worst, abs(dv) / max(w[at.scale_v + r, n], 1e-300))
     return worst
 
 
 @inner
-def _newton(lin: Linear, el: Elements, mem: Memory, mot: Motion, n: int, q0: np.ndarray, v0: np.ndarray, g: np.ndarray) -> None:
-    """Converged Newton with line search in lane n; g (R, lanes) enters as the guess and leaves as the solution."""
-    size, w = len(g), 0 if lin.shared else n
-    here, change, attempt = np.empty(size), np.zeros(size), np.empty(size)
-    at, tried, matrix = np.zeros((4, size)), np.empty((4, size)), np.empty((size, size))
-    for r in range(size):
-        here[r] = g[r, n]
+def _newton(at: At, w: np.ndarray, walks: Walks, n: int) -> None:
+    """Converged Newton with line search in lane n; the rows ``fresh`` enter as the guess and leave as the solution."""
+    joints = at.joints
+    here, change, attempt, out, tried, matrix = (walks.work[1], walks.work[2], walks.work[3], walks.work[4:8], walks.work[8:12],
+                                                 walks.work[12:])
+    for r in range(joints):
+        here[r], change[r] = w[at.fresh + r, n], 0.0
     merit, small = math.inf, False
     for iteration in range(MOST_ITERATIONS + 1):
         # the first pass only evaluates at the guess; one place that evaluates keeps the compiled code short
         if iteration > 0:
-            mot.iterations[n] += 1
+            walks.counts[0, n] += 1
             merit = 0.0
-            for r in range(size):
-                change[r] = at[0, r]
-                merit += at[0, r] ** 2
-                for t in range(size):
-                    matrix[r, t] = at[1, r] * lin.sq[r, t, w] + at[2, r] * lin.sv[r, t, w] + (1.0 if r == t else 0.0)
-            _eliminate(matrix, change)
+            for r in range(joints):
+                change[r] = out[0, r]
+                merit += out[0, r] ** 2
+                for t in range(joints):
+                    at_rt = r * joints + t
+                    matrix[r, t] = out[1, r] * w[at.sq + at_rt, n] + out[2, r] * w[at.sv + at_rt, n] + (1.0 if r == t else 0.0)
+            _eliminate(matrix, change, joints)
         length = 1.0
         for _search in range(12):
             total = 0.0
-            for r in range(size):
+            for r in range(joints):
                 attempt[r] = here[r] + length * change[r]
-            _residual(lin, el, mem, n, q0, v0, attempt, tried)
-            for r in range(size):
+            _residual(at, w, walks, n, attempt, tried)
+            for r in range(joints):
                 total += tried[0, r] ** 2
-            small = iteration > 0 and (_excess(lin, mot, n, tried) <= CONVERGED or not math.isfinite(total))
+            small = iteration > 0 and (_excess(at, w, n, tried) <= CONVERGED or not math.isfinite(total))
             if small or not total > merit * (1 - 1e-4 * length):
                 break
             length *= 0.5
-        for r in range(size):
+        for r in range(joints):
             here[r] = attempt[r]
-        _copy(tried, at)
+            for i in range(4):
+                out[i, r] = tried[i, r]
         if small:
             break
     else:
-        mot.failures[n] += 1
-    for r in range(size):
-        g[r, n] = here[r]
+        walks.counts[1, n] += 1
+    for r in range(joints):
+        w[at.fresh + r, n] = here[r]
+
+
+@inner
+def _doubted(at: At, w: np.ndarray, walks: Walks, again: int) -> None:
+    """Lanes in doubt: take the corrected forces as the next guess, or with ``again`` > 0 let Newton's method find them."""
+    for n in range(WIDTH):
+        if w[at.doubt, n] > 0.0 and again == 0:
+            for r in range(at.joints):
+                w[at.g + r, n] = w[at.fresh + r, n]
+        elif w[at.doubt, n] > 0.0 and n < at.filled:
+            for r in range(at.joints):
+                w[at.fresh + r, n] = w[at.g + r, n]
+            _newton(at, w, walks, n)
+    for n in range(at.filled, WIDTH):
+        for r in range(at.joints):
+            w[at.fresh + r, n] = w[at.fresh + r, at.filled - 1]
 
 
 # --- the loop -----------------------------------------------------------------------------------------------------------------
 
 
-@inner
-def _doubts(lin: Linear, mot: Motion, q: np.ndarray, v: np.ndarray, fq: np.ndarray, fv: np.ndarray, eq: np.ndarray, ev: np.ndarray) -> bool:
-    """Bring the scales up to date, mark lanes whose residual is too large for the first-order correction."""
-    size, lanes = q.shape
-    scale_q, scale_v, steep_q, steep_v, doubt = mot.scale_q, mot.scale_v, mot.steep_q, mot.steep_v, mot.doubt
-    for n in range(lanes):
-        steep_q[n], steep_v[n], doubt[n] = 0.0, 0.0, 0.0
-    for r in range(size):
-        for n in range(lanes):
-            scale_q[r, n] = max(scale_q[r, n], abs(q[r, n]))
-        for n in range(lanes):
-            steep_q[n] = max(steep_q[n], abs(fq[r, n]))
-        if lin.velocity:
-            for n in range(lanes):
-                scale_v[r, n] = max(scale_v[r, n], abs(v[r, n]))
-            for n in range(lanes):
-                steep_v[n] = max(steep_v[n], abs(fv[r, n]))
-    for n in range(lanes):
-        contraction = steep_q[n] * lin.reach_q[0 if lin.shared else n] + steep_v[n] * lin.reach_v[0 if lin.shared else n]
-        steep_q[n] = ACCEPT / max(contraction, SMALLEST_CONTRACTION)
-    worst = 0.0
-    for r in range(size):
-        for n in range(lanes):
-            doubt[n] = max(doubt[n], abs(eq[r, n]) - steep_q[n] * scale_q[r, n])
-        if lin.velocity:
-            for n in range(lanes):
-                doubt[n] = max(doubt[n], abs(ev[r, n]) - steep_q[n] * scale_v[r, n])
-    for n in range(lanes):
-        worst = max(worst, doubt[n])
-    return worst > 0.0
+@inline
+def _attempt(at: At, w: np.ndarray, walks: Walks, table: np.ndarray) -> bool:
+    """One evaluation at the guess g with a first-order correction into the rows ``fresh``; whether any lane is in doubt."""
+    joints = at.joints
+    for r in range(joints):
+        store(w, at.q + r, load(w, at.q0 + r) - _given(w, at.sq, r, at.g, joints))
+        if at.velocity:
+            store(w, at.v + r, load(w, at.v0 + r) - _given(w, at.sv, r, at.g, joints))
+    evaluate(at, w, walks, table, at.q, at.v, at.force, at.slope_q, at.slope_v)
+    steep_q, steep_v = spread(0.0), spread(0.0)
+    for r in range(joints):
+        store(w, at.error + r, load(w, at.force + r) - load(w, at.g + r))
+        steep_q, steep_v = larger(size(load(w, at.slope_q + r)), steep_q), larger(size(load(w, at.slope_v + r)), steep_v)
+    contraction = steep_q * load(w, at.reach) + steep_v * load(w, at.reach + 1)
+    limit = ACCEPT / larger(contraction, spread(SMALLEST_CONTRACTION))
+    doubt = spread(0.0)
+    for r in range(joints):
+        moved = _given(w, at.sq, r, at.error, joints)
+        fresh = load(w, at.force + r) - load(w, at.slope_q + r) * moved
+        scale = larger(size(load(w, at.q + r)), load(w, at.scale_q + r))
+        store(w, at.scale_q + r, scale)
+        doubt = larger(size(moved) - limit * scale, doubt)
+        if at.velocity:
+            moved = _given(w, at.sv, r, at.error, joints)
+            fresh = fresh - load(w, at.slope_v + r) * moved
+            scale = larger(size(load(w, at.v + r)), load(w, at.scale_v + r))
+            store(w, at.scale_v + r, scale)
+            doubt = larger(size(moved) - limit * scale, doubt)
+        store(w, at.fresh + r, fresh)
+    store(w, at.doubt, doubt)
+    return bool(lanes_of(doubt > 0.0) != 0)
 
 
-@inner
-def _attempt(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarray) -> bool:
-    """One evaluation at the guess mot.g with a first-order correction into mot.new; whether any lane is in doubt."""
-    q0, v0, q, v, f, fq, fv, e, eq, ev = work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7], work[8], work[9]
-    size, lanes = q.shape
-    _moved(lin.shared, lin.sq, lin.square_q, q0, mot.g, q)
-    if lin.velocity:
-        _moved(lin.shared, lin.sv, lin.square_v, v0, mot.g, v)
-    evaluate(el, mem, q, v, f, fq, fv, mot.scratch)
-    for r in range(size):
-        for n in range(lanes):
-            e[r, n] = f[r, n] - mot.g[r, n]
-    _give(lin.shared, lin.sq, lin.square_q, e, eq)
-    for r in range(size):
-        for n in range(lanes):
-            mot.new[r, n] = f[r, n] - fq[r, n] * eq[r, n]
-    if lin.velocity:
-        _give(lin.shared, lin.sv, lin.square_v, e, ev)
-        for r in range(size):
-            for n in range(lanes):
-                mot.new[r, n] -= fv[r, n] * ev[r, n]
-    return _doubts(lin, mot, q, v, fq, fv, eq, ev)
-
-
-@inner
-def _guess(mot: Motion) -> None:
+@inline
+def _guess(at: At, w: np.ndarray, extrapolate: bool) -> None:
     """Extrapolate the joint forces through the last three steps, once there are three."""
-    _copy(mot.before, mot.older)
-    _copy(mot.old, mot.before)
-    _copy(mot.g, mot.old)
-    if mot.age[0] > 2:
-        g, old, before, older = mot.g, mot.old, mot.before, mot.older
-        for r in range(g.shape[0]):
-            for n in range(g.shape[1]):
-                g[r, n] = 3.0 * (old[r, n] - before[r, n]) + older[r, n]
-    mot.age[0] += 1
+    for r in range(at.joints):
+        third, second, first = load(w, at.before + r), load(w, at.last_g + r), load(w, at.g + r)
+        store(w, at.older + r, third)
+        store(w, at.before + r, second)
+        store(w, at.last_g + r, first)
+        if extrapolate:
+            store(w, at.g + r, 3.0 * (first - second) + third)
+
+
+@inline
+def _store(at: At, w: np.ndarray, rows: np.ndarray, to: int, u: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
+    """Write rows @ (displacement, velocity, acceleration) where they are wanted."""
+    if len(u):
+        _rows(rows, w, at.x, u, to)
+    if len(v):
+        _rows(rows, w, at.x + at.modes, v, to)
+    if len(a):
+        for m in range(at.modes):
+            rest = load(w, at.damping + m) * load(w, at.x + at.modes + m) + load(w, at.stiffness + m) * load(w, at.x + m)
+            store(w, at.y + m, load(w, at.f + m) - rest)
+        _rows(rows, w, at.y, a, to)
 
 
 @inner
-def _store(lin: Linear, mot: Motion, rows: np.ndarray, k: int, outs: tuple[Any, ...], acceleration: np.ndarray) -> None:
-    if len(outs[0]):
-        _rows(rows, mot.x[0], outs[0][k])
-    if len(outs[1]):
-        _rows(rows, mot.x[1], outs[1][k])
-    if len(outs[2]):
-        for m in range(len(acceleration)):
-            for n in range(acceleration.shape[1]):
-                w = 0 if lin.shared else n
-                acceleration[m, n] = mot.f[m, n] - lin.damping[m, w] * mot.x[1, m, n] - lin.stiffness[m, w] * mot.x[0, m, n]
-        _rows(rows, acceleration, outs[2][k])
+def _begin(at: At, w: np.ndarray, walks: Walks, table: np.ndarray) -> None:
+    """Load every history from rest to the rows q0 along a straight path; the rows g become the force at q0, v0."""
+    for i in range(1, PRELOAD_STEPS + 1):
+        for r in range(at.joints):
+            store(w, at.q + r, load(w, at.q0 + r) * (i / PRELOAD_STEPS))
+            store(w, at.v + r, load(w, at.v0 + r) * (1.0 if i == PRELOAD_STEPS else 0.0))
+        commit(at, w, walks, table, at.q, at.v)
+    evaluate(at, w, walks, table, at.q0, at.v0, at.g, at.slope_q, at.slope_v)
 
 
 @kernel
-def advance(lin: Linear, el: Elements, mem: Memory, mot: Motion, work: np.ndarray, first: int, last: int, force: np.ndarray,
-            rows: np.ndarray,
-            every: int, outs: tuple[Any, ...]) -> int:
+def advance(at: At, w: np.ndarray, walks: Walks, b: np.ndarray, first: int, last: int, force: np.ndarray, rows: np.ndarray, every: int,
+            u: np.ndarray, v: np.ndarray, a: np.ndarray) -> int:
     """Steps ``first`` to ``last`` of a call; returns where it stopped, before ``last`` only if a stack of reversals needs more room.
 
-    ``force`` (last, m, 1 or lanes), empty for none; ``outs``: three arrays (stored, L, lanes), empty where not wanted.
+    ``force`` (last, m, 1 or 8), empty for none; ``u``, ``v``, ``a``: (stored, L, 8), empty where not wanted. With ``first`` below 0 the
+    histories are loaded instead, see ``_begin``.
     """
-    y, back, size = mot.y, mot.back, len(mot.g)
-    q0, v0, q, v = work[0], work[1], work[2], work[3]
+    table, clock, room = walks.table, walks.clock, walks.ends.shape[2]
+    if first < 0:
+        _begin(at, w, walks, table)
+        return last
+    age, deepest = clock[0], clock[1]
     for i in range(first, last):
-        if mem.deepest[0] + 4 > mem.ends.shape[2]:
+        if deepest + 4 > room:
+            clock[0], clock[1] = age, deepest
             return i
-        p = force[i] if len(force) else back[:0]
-        _predict(lin.shared, lin.a, lin.old, mot.x, mot.f, y)
-        if len(p):
-            _push(lin, p, y)
-        if size:
-            _rows(lin.b, y[0], q0)
-            if lin.velocity:
-                _rows(lin.b, y[1], v0)
-            _guess(mot)
-            for attempt in range(2):
-                if not _attempt(lin, el, mem, mot, work):
+        _predict(at, w, force, i)
+        if at.joints:
+            _rows(b, w, at.y, w, at.q0)
+            if at.velocity:
+                _rows(b, w, at.y + at.modes, w, at.v0)
+            _guess(at, w, age > 2)
+            age += 1
+            for again in range(2):
+                if not _attempt(at, w, walks, table):
                     break
-                for n in range(len(mot.doubt)):
-                    if mot.doubt[n] > 0.0 and attempt == 0:
-                        for r in range(size):
-                            mot.g[r, n] = mot.new[r, n]
-                    elif mot.doubt[n] > 0.0:
-                        for r in range(size):
-                            mot.new[r, n] = mot.g[r, n]
-                        _newton(lin, el, mem, mot, n, q0, v0, mot.new)
-            _copy(mot.new, mot.g)
-            if mem.present:
-                _moved(lin.shared, lin.sq, lin.square_q, q0, mot.g, q)
-                _moved(lin.shared, lin.sv, lin.square_v, v0, mot.g, v)
-                mem.deepest[0] = max(mem.deepest[0], commit(el, mem, q, v, mot.scratch[4]))
-            _rows(lin.bt, mot.g, back)
-        _correct(lin.shared, lin.new, y, back, p, mot.x, mot.f)
+                _doubted(at, w, walks, again)
+            for r in range(at.joints):
+                store(w, at.g + r, load(w, at.fresh + r))
+            if at.memory:
+                for r in range(at.joints):
+                    store(w, at.q + r, load(w, at.q0 + r) - _given(w, at.sq, r, at.g, at.joints))
+                    store(w, at.v + r, load(w, at.v0 + r) - _given(w, at.sv, r, at.g, at.joints))
+                deepest = max(deepest, commit(at, w, walks, table, at.q, at.v))
+        _correct(at, w, b, force, i)
         if (i + 1) % every == 0:
-            _store(lin, mot, rows, i // every, outs, mot.acceleration)
+            _store(at, w, rows, (i // every) * len(rows), u, v, a)
+    clock[0], clock[1] = age, deepest
     return last
 
 

@@ -199,7 +199,7 @@ def _stepper(request: _Request, coefficients: Steps, omega: Array, zeta: Array, 
         known = [code for code in codes if code is not None]
         if len(known) == len(codes):
             if progress is not None and not ready():
-                progress("compiling the time loop, once on this computer: about half a minute")
+                progress("compiling the time loop, once on this computer: a quarter of a minute")
             return CompiledStepper(coefficients, joints, known, *start), True
     with np.errstate(over="ignore", invalid="ignore"):
         return NumpyStepper(coefficients, joints, *start), False
