@@ -174,8 +174,8 @@ class Block:
         stiffness, slip = (np.stack([x[i] for x in made]) if made else np.zeros((0, LANES, 0)) for i in (0, 1))
         theta = np.stack([np.broadcast_to(x[2][:, 0], (LANES,)) for x in made]) if made else np.zeros((0, LANES))
         stacks = np.zeros((2, count, LANES, ROOM))
-        return Walks(dt, table, np.array([c[1] for c in codes], dtype=float), p, np.zeros((count, LANES), dtype=np.int64), stacks[0], stacks[1], theta,
-                     stiffness, slip, np.zeros_like(slip), np.zeros_like(slip), np.zeros((2, LANES), dtype=np.int64),
+        return Walks(dt, table, np.array([c[1] for c in codes], dtype=float), p, np.zeros((count, LANES), dtype=np.int64), stacks[0],
+                     stacks[1], theta, stiffness, slip, np.zeros_like(slip), np.zeros_like(slip), np.zeros((2, LANES), dtype=np.int64),
                      np.zeros(2, dtype=np.int64), np.zeros((12 + len(self.b), max(4, len(self.b)))))
 
     def begin(self, u: Array, v: Array, modal: Array) -> None:
