@@ -18,7 +18,7 @@ ALLOWED = {
     "emcee": re.compile(r"inference/ensemble\.py"),
     "arviz": re.compile(r"inference/arviz_export\.py"),
     "matplotlib": re.compile(r"study/figures(_\w+)?\.py"),
-    "numba": re.compile(r"(forces|simulation)/compiled\.py"),
+    "numba": re.compile(r"(forces|simulation)/compiled\.py|simulation/vector\.py"),
 }
 LINES = 420
 BODY = 70
