@@ -15,7 +15,6 @@ DONE, REFUSED, BAD_INPUT, STOPPED = 0, 1, 2, 130
 _ABSENT = {
     "compare": "the comparison of scenarios",
     "montecarlo": "Monte Carlo sensitivity",
-    "frf": "stepped-sine response curves by continuation",
 }
 
 
@@ -67,9 +66,12 @@ def _parser() -> argparse.ArgumentParser:
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
     diagnose.add_argument("study", metavar="PATH", help="case folder")
     for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),
-                       ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
-                       ("frf", "stepped-sine response curves with posterior bands")):
+                       ("montecarlo", "parameter distributions to backbone bands and Sobol indices")):
         add(name, f"{what} (not in this version)", _absent, out=True).add_argument("study", metavar="STUDY.toml")
+    for name, what in (("frf", "stepped-sine response curves with posterior bands"),):
+        extra = add(name, f"{what}; the run comes first where it is missing", _extra, out=True)
+        extra.add_argument("study", metavar="STUDY.toml")
+        extra.add_argument("--fresh", action="store_true", help="compute this again; the run itself is kept")
     report = add("report", "write report.html again from stored results", _report)
     report.add_argument("out", metavar="DIR")
     add("terms", "the library of force laws as a table", _terms)
@@ -105,7 +107,10 @@ def _executor(text: str) -> str:
     if text == "local":
         return text
     if text.startswith("dask://"):
-        raise argparse.ArgumentTypeError("dask executors are not in this version; use --executor local with --workers N")
+        host, colon, port = text.removeprefix("dask://").rpartition(":")
+        if host and colon and port.isdigit():
+            return text
+        raise argparse.ArgumentTypeError(f"{text!r} names no scheduler; write dask://HOST:PORT")
     raise argparse.ArgumentTypeError(f"{text!r} is neither local nor dask://HOST:PORT")
 
 
@@ -127,7 +132,8 @@ def _run(options: argparse.Namespace) -> int:
     from bayes_nlsid.study.run import run_study
 
     study, out = read_study(options.study), Path(options.out)
-    result = run_study(study, out, seed=options.seed, workers=options.workers, fresh=options.fresh, reporter=_reporter(options, out))
+    result = run_study(study, out, seed=options.seed, workers=options.workers, executor=options.executor, fresh=options.fresh,
+                       reporter=_reporter(options, out))
     if not options.quiet:
         from bayes_nlsid.study.screen import summary
 
@@ -135,6 +141,23 @@ def _run(options: argparse.Namespace) -> int:
     elif result["status"] != "ok":
         print(f"nlsid: {result['status']}: {'; '.join(result['reasons'])}", file=sys.stderr)
     return DONE if result["status"] == "ok" else REFUSED
+
+
+def _extra(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.reading import read_study
+    from bayes_nlsid.study.run import run_study
+
+    study, out = read_study(options.study), Path(options.out)
+    result = run_study(study, out, seed=options.seed, workers=options.workers, executor=options.executor, fresh=options.fresh,
+                       extra=options.command, reporter=_reporter(options, out))
+    found = result[options.command]
+    if not options.quiet:
+        from bayes_nlsid.study.screen import extra_summary
+
+        print(extra_summary(options.command, result, out))
+    elif found["status"] != "ok":
+        print(f"nlsid: {found['status']}: {'; '.join(found['reasons'])}", file=sys.stderr)
+    return DONE if found["status"] == "ok" else REFUSED
 
 
 def _check(options: argparse.Namespace) -> int:

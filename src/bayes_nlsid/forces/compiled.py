@@ -301,3 +301,15 @@ def march_bouc_wen(moves: NDArray[np.float64], p: NDArray[np.float64]) -> NDArra
             z = memory.bouc_wen_step(z, moves[i], p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
             force[b, i] = z
     return force
+
+
+@compiled
+def march_bouc_wen_each(start: NDArray[np.float64], moves: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bouc–Wen forces (B, N + 1) from a force (B,) along moves of each sample's own (B, N); p (B, 5)."""
+    batch, count = moves.shape
+    force = np.empty((batch, count + 1))
+    for b in range(batch):
+        force[b, 0] = start[b]
+        for i in range(count):
+            force[b, i + 1] = memory.bouc_wen_step(force[b, i], moves[b, i], p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
+    return force

@@ -49,6 +49,33 @@ def march(kind: str, nodes: NDArray[np.float64], p: NDArray[np.float64]) -> NDAr
     return _bouc_wen(moves, p)
 
 
+def march_bouc_wen_each(start: NDArray[np.float64], moves: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bouc–Wen forces along a path of each sample's own.
+
+    Parameters
+    ----------
+    start : ndarray (B,)
+        Force at the first node, N.
+    moves : ndarray (B, N)
+        From node to node, m.
+    p : ndarray (B, 5)
+        Parameters, SI.
+
+    Returns
+    -------
+    ndarray (B, N + 1)
+        N.
+    """
+    if compiled_wanted():
+        from bayes_nlsid.forces import compiled
+        return compiled.march_bouc_wen_each(*map(np.ascontiguousarray, (start, moves, p)))
+    force = np.empty((len(start), moves.shape[1] + 1))
+    force[:, 0] = start
+    for i in range(moves.shape[1]):
+        force[:, i + 1] = bouc_wen_step(force[:, i], moves[:, i], *p.T)
+    return force
+
+
 def _sliders(moves: NDArray[np.float64], stiffness: NDArray[np.float64], slip: NDArray[np.float64],
              theta: NDArray[np.float64]) -> NDArray[np.float64]:
     stretch, sliding = np.zeros_like(slip), np.zeros_like(slip)

@@ -19,7 +19,7 @@ from bayes_nlsid.recordings.recording import Recording
 from bayes_nlsid.structure.modal import ModalModel
 from bayes_nlsid.study.building import library, model_from
 from bayes_nlsid.study.progress import Progress
-from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.schema import EXTRAS, Study
 from bayes_nlsid.study.store import Saved, digest, file_digest, versions
 
 Arrays = dict[str, NDArray[Any]]
@@ -53,6 +53,8 @@ class Context:
     seed : int
     workers : int
         How many processes or threads a stage may use; results do not depend on it.
+    executor : str
+        Where stages of many tasks have them done: ``local`` or ``dask://HOST:PORT``; results do not depend on it either.
     done : dict of str to Saved
         Stages finished so far, in order; the run adds to it.
     progress : callable
@@ -66,6 +68,7 @@ class Context:
     study: Study
     seed: int
     workers: int = 1
+    executor: str = "local"
     done: dict[str, Saved] = field(default_factory=dict)
     progress: Progress = _silent
     note: Callable[[str], None] = _quiet
@@ -117,14 +120,14 @@ class Context:
         study = self.study
         tables: dict[str, tuple[Any, ...]] = {
             "read": (), "linear": (study.structure, study.reduction, study.linear), "identify": (study.identification, *study.terms),
-            "posterior": (study.posterior,), "predict": (study.prediction,)}
+            "posterior": (study.posterior,), "predict": (study.prediction,), "frf": (study.frf,)}
         out: dict[str, Any] = {
             "tables": digest([None if t is None else _plain(asdict(t)) for t in tables[stage]]), "code": code_digest(stage),
             "versions": {name: value for name, value in versions().items() if name in _NUMERICAL},
-            "earlier": {name: saved.key for name, saved in self.done.items()}}
+            "earlier": {name: saved.key for name, saved in self.done.items() if not (stage in EXTRAS and name in ("predict", *EXTRAS))}}
         if stage == "read":
             out["recordings"] = [_recording_key(spec) for spec in study.recordings]
-        if stage in ("identify", "posterior", "predict"):
+        if stage not in ("read", "linear"):
             out["seed"] = self.seed
         return out
 
@@ -149,7 +152,7 @@ def code_digest(stage: str) -> str:
     package = Path(__file__).resolve().parents[1]
     digest_ = hashlib.sha256()
     for name, rooms in _ROOMS.items():
-        for room in (*rooms, f"study/stage_{name}.py"):
+        for room in (*rooms, f"study/stage_{name}.py", *((f"study/stage_{stage}.py",) if stage in EXTRAS else ())):
             path = package / room
             for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
                 if file.exists():

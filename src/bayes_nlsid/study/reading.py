@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
 from bayes_nlsid.recordings.units import unit_factor
+from bayes_nlsid.study.reading_extras import read_frf
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
 from bayes_nlsid.study.schema import LinearEntry, Study
@@ -54,12 +55,13 @@ def read_study(path: Path | str) -> Study:
     names = tuple(r.name for r in recordings)
     prediction = read_prediction(top.table("prediction"), locations, names)
     report = read_report(top.table("report"))
+    frf = read_frf(top.table("frf"), locations)
     top.close()
-    _check_order(file, identification is not None, posterior is not None, prediction is not None, recordings)
+    _check_order(file, identification is not None, {"posterior": posterior, "prediction": prediction, "frf": frf}, recordings)
     files = dict.fromkeys([*(p for _, p in structure.files), *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
     return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
-                 report, locations, ((file.name, file_digest(file)), *inputs))
+                 report, frf, locations, ((file.name, file_digest(file)), *inputs))
 
 
 def _parse(file: Path) -> dict[str, Any]:
@@ -84,13 +86,12 @@ def _relative(path: Path, folder: Path) -> str:
         return path.as_posix()
 
 
-def _check_order(file: Path, identification: bool, posterior: bool, prediction: bool, recordings: Sequence[RecordingSpec]) -> None:
-    """A stage needs the one before it."""
-    needs = [("posterior", posterior, "identification", identification), ("prediction", prediction, "identification", identification)]
-    for asked, present, needed, there in needs:
-        if present and not there:
-            raise InputError(f"{file.name}: [{asked}]", f"needs a table [{needed}], which is missing",
-                             f"add [{needed}] or remove [{asked}]")
+def _check_order(file: Path, identification: bool, later: Mapping[str, object], recordings: Sequence[RecordingSpec]) -> None:
+    """Everything that uses a model needs one to be identified."""
+    for asked, entry in later.items():
+        if entry is not None and not identification:
+            raise InputError(f"{file.name}: [{asked}]", "needs a table [identification], which is missing",
+                             f"add [identification] or remove [{asked}]")
     if identification and not any(r.role == "train" for r in recordings):
         raise InputError(f"{file.name}: [[recordings]]", 'none has role = "train", so there is nothing to identify from',
                          'give one of them role = "train"')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,13 @@ from bayes_nlsid.study.archive import keep_study, stored_study, study_text
 from bayes_nlsid.study.context import Context, Result
 from bayes_nlsid.study.progress import Reporter
 from bayes_nlsid.study.report import Report, render
-from bayes_nlsid.study.schema import STAGES, Study
+from bayes_nlsid.study.schema import EXTRAS, STAGES, Study
 from bayes_nlsid.study.store import Saved, Store, write_atomic
 from bayes_nlsid.study.summary import summarise, to_text
 
 # a stage is a pure function of the context: what it returns is stored, and stored results are all that later stages see
-_STAGES = {stage: (f"bayes_nlsid.study.stage_{stage}", stage) for stage in STAGES if stage != "report"}
+_STAGES = {stage: (f"bayes_nlsid.study.stage_{stage}", stage) for stage in (*STAGES, *EXTRAS) if stage != "report"}
+_TABLES = {"frf": ("frf", 'input, output, levels and band')}
 
 
 def _stage(name: str) -> Callable[[Context], Result]:
@@ -28,8 +29,8 @@ def _stage(name: str) -> Callable[[Context], Result]:
     return found
 
 
-def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers: int = 1, fresh: bool = False,
-              reporter: Reporter | None = None) -> dict[str, Any]:
+def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers: int = 1, executor: str = "local", fresh: bool = False,
+              extra: str | None = None, reporter: Reporter | None = None) -> dict[str, Any]:
     """Run every stage the study names and write the files of the results folder.
 
     Parameters
@@ -41,8 +42,12 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
         In place of the study's own.
     workers : int
         Processes or threads within a stage; the results do not depend on it.
+    executor : str
+        Where work of many tasks is done: ``local`` or ``dask://HOST:PORT``; the results do not depend on it.
     fresh : bool
-        Compute everything again.
+        Compute everything again; with ``extra``, that alone.
+    extra : str, optional
+        A stage beside the run, "frf" or "montecarlo", computed from the finished run, which is taken from disk where it is there.
     reporter : Reporter, optional
 
     Returns
@@ -57,21 +62,33 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
     KeyboardInterrupt
         Passed on; finished stages and sampler checkpoints stay, and the next run goes on from them.
     """
+    if extra is not None and getattr(study, _TABLES[extra][0]) is None:
+        raise InputError(f"{study.file.name}: [{extra}]", "is missing", f"add [{extra}] with {_TABLES[extra][1]}")
     store = Store(out)
     with store.lock():
         store.sweep()
         keep_study(store.stages, study, study.seed if seed is None else seed)
         told = reporter if reporter is not None else Reporter((store.out / "run.log",))
-        context = Context(study, study.seed if seed is None else seed, workers, {}, told.update, told.note, store.scratch)
-        for number, name in enumerate(study.stages, start=1):
-            if name == "report":
-                told.begin(number, len(study.stages), name, "always written anew")
-                began = time.monotonic()
-                result = finish(store, study, context.done, context.seed, told)
-                told.end(time.monotonic() - began, reused=False)
-            else:
-                context.done[name] = _one(store, context, name, (number, len(study.stages)), fresh, told)
+        context = Context(study, study.seed if seed is None else seed, workers, executor, {}, told.update, told.note, store.scratch)
+        stages = [*study.stages[:-1], *([extra] if extra is not None else []), "report"]
+        for number, name in enumerate(stages[:-1], start=1):
+            context.done[name] = _one(store, context, name, (number, len(stages)), fresh and extra in (None, name), told)
+        context.done.update(kept_extras(store, study, context.done))
+        told.begin(len(stages), len(stages), "report", "always written anew")
+        began = time.monotonic()
+        result = finish(store, study, context.done, context.seed, told)
+        told.end(time.monotonic() - began, reused=False)
     return result
+
+
+def kept_extras(store: Store, study: Study, done: Mapping[str, Saved]) -> dict[str, Saved]:
+    """What commands beside the run have left, as far as it belongs to these very results."""
+    out = {}
+    for name in EXTRAS:
+        saved = done.get(name) or (store.load(name) if getattr(study, name) is not None else None)
+        if saved is not None and all(done[stage].key == key for stage, key in saved.data["from"].items() if stage in done):
+            out[name] = saved
+    return out
 
 
 def _one(store: Store, context: Context, name: str, place: tuple[int, int], fresh: bool, told: Reporter) -> Saved:
@@ -88,6 +105,8 @@ def _one(store: Store, context: Context, name: str, place: tuple[int, int], fres
         store.clear_scratch(name)
     began = time.monotonic()
     arrays, data = _stage(name)(context)
+    if name in EXTRAS:
+        data["from"] = context.inputs(name)["earlier"]
     saved = store.save(name, key, arrays, data, time.monotonic() - began, context.inputs(name))
     store.clear_scratch(name)
     told.end(saved.seconds, reused=False)
@@ -104,6 +123,9 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
         write_atomic(store.out / "posterior.nc", done["posterior"].arrays["netcdf"].tobytes())
     if "predict" in done and "amplitude" in done["predict"].arrays:
         _write_backbone(done["predict"], store.out / "backbone.npz")
+    for name in EXTRAS:
+        if name in done:
+            write_atomic(store.out / f"{name}.npz", npz(done[name].arrays))
     pictures = draw_all(study, done, told.update if told is not None else None)
     folder = store.out / "figures"
     folder.mkdir(exist_ok=True)
@@ -115,17 +137,22 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
 
 def _write_backbone(saved: Saved, path: Path) -> None:
     """The arrays of the contract, with the backbone measured directly beside them."""
-    from io import BytesIO
-
-    import numpy as np
-
     wanted = ("amplitude", *(f"{q}_{level}" for q in ("frequency", "damping") for level in ("q05", "q50", "q95")), "samples_frequency",
               "samples_damping", "numerical_error_frequency")
     arrays = {name: saved.arrays[name] for name in wanted}
     arrays |= {name.replace("measured.", "measured_"): a for name, a in saved.arrays.items() if name.startswith("measured.")}
+    write_atomic(path, npz(arrays))
+
+
+def npz(arrays: Mapping[str, Any]) -> bytes:
+    """Arrays as the bytes of an npz file."""
+    from io import BytesIO
+
+    import numpy as np
+
     buffer = BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    write_atomic(path, buffer.getvalue())
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
 
 
 def rebuild_report(out: Path | str) -> dict[str, Any]:
@@ -142,4 +169,5 @@ def rebuild_report(out: Path | str) -> dict[str, Any]:
     store = Store(out)
     with store.lock():
         done = {name: saved for name in study.stages if (saved := store.load(name)) is not None}
+        done |= kept_extras(store, study, done)
         return finish(store, study, done, seed)

@@ -10,6 +10,8 @@ from bayes_nlsid.recordings.reading import RecordingSpec
 
 StructureKind = Literal["beam", "matrices", "oscillator"]
 STAGES = ("read", "linear", "identify", "posterior", "predict", "report")
+EXTRAS = ("frf",)
+"""Stages with commands of their own, computed from a finished run."""
 
 
 @final
@@ -193,6 +195,23 @@ class PredictionEntry:
 
 @final
 @dataclass(frozen=True)
+class FrfEntry:
+    """``[frf]``: stepped-sine response curves of ``nlsid frf``.
+
+    ``drive`` (``input`` in the file) and ``at`` (``output``) name locations, ``levels`` are amplitudes of the force (N), ``band`` is in Hz,
+    ``harmonics`` the highest, None to find how many are needed; ``samples`` is the number of posterior draws.
+    """
+
+    drive: str
+    at: str
+    levels: tuple[float, ...]
+    band: tuple[float, float]
+    harmonics: int | None = None
+    samples: int = 100
+
+
+@final
+@dataclass(frozen=True)
 class PublishedEntry:
     """``[[report.published]]``: a figure from the literature to stand beside ours; spans of frequency (Hz) and damping ratio."""
 
@@ -228,6 +247,8 @@ class Study:
     linear : LinearEntry
     identification, posterior, prediction : entries or None
         A stage whose table is missing is not run.
+    frf : entry or None
+        What the command of that name computes.
     terms : tuple of UserTermEntry
     report : ReportEntry
     locations : tuple of str
@@ -248,6 +269,7 @@ class Study:
     posterior: PosteriorEntry | None = None
     prediction: PredictionEntry | None = None
     report: ReportEntry = field(default_factory=ReportEntry)
+    frf: FrfEntry | None = None
     locations: tuple[str, ...] = ()
     inputs: tuple[tuple[str, str], ...] = ()
 

@@ -58,6 +58,18 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
     return "\n".join([*parts, f"\nin {out}: {files}"])
 
 
+def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
+    """One screen for a command beside the run."""
+    from bayes_nlsid.study.report_extras import response_rows
+
+    found = result[name]
+    parts = [f"{result['title']}: {'done' if found['status'] == 'ok' else found['status']}"]
+    parts += [_wrapped(f"  {reason}") for reason in found["reasons"][:4]]
+    head = ["force", "peak (Hz)", "5-95 %", f"amplitude at {found['output']}", "5-95 %", "harmonics"]
+    parts.append("\n" + columns(head, response_rows(found), right=(0, 1, 2, 3, 4, 5)))
+    return "\n".join([*parts, f"\nin {out}: report.html, {name}.npz, result.json, figures/"])
+
+
 def plan(study: Study) -> str:
     """What a run would do."""
     parts = [f"{study.title} ({study.file.name}): everything it names is there and readable.", ""]

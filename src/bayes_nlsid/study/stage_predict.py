@@ -35,7 +35,7 @@ def predict(context: Context) -> Result:
     entry = context.study.prediction
     assert entry is not None
     model, theta = stored_model(context)
-    draws = _draws(context, theta, max(entry.samples, entry.draws))
+    draws = posterior_draws(context, theta, max(entry.samples, entry.draws))
     arrays: Arrays = {}
     data: dict[str, Any] = {"at": entry.at, "mode": entry.mode, "notes": [], "alternatives": [], "loops": [], "heldout": []}
     context.progress(0.02, "backbone")
@@ -55,13 +55,13 @@ def predict(context: Context) -> Result:
     return arrays, data
 
 
-def _draws(context: Context, theta: Array, count: int) -> Array:
+def posterior_draws(context: Context, theta: Array, count: int, stage: str = "predict") -> Array:
     """Draws of theta (S, P): spread over the stored chains, or the fit once."""
     if "posterior" not in context.done:
         return theta[None]
     chains = np.asarray(context.done["posterior"].arrays["theta"], dtype=float)
     flat = chains.reshape(-1, chains.shape[-1])
-    rng = np.random.default_rng(context.random("predict"))
+    rng = np.random.default_rng(context.random(stage))
     return flat[rng.choice(len(flat), size=min(count, len(flat)), replace=False)]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.schema import EXTRAS, Study
 from bayes_nlsid.study.store import Saved, versions
 
 STATUSES = ("ok", "not_converged", "not_identifiable", "failed")
@@ -36,6 +36,9 @@ def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, A
     if "predict" in done:
         out["heldout"] = _heldout(done["predict"])
         out["backbone"] = done["predict"].data.get("backbone", {})
+    for name in EXTRAS:
+        if name in done:
+            out[name] = done[name].data["summary"]
     return _finite(out)
 
 

@@ -101,6 +101,14 @@ amplitude = "2 mm"                # where the released decay starts
 mode = 1
 samples = 50
 heldout = ["later part"]
+
+[frf]                             # for nlsid frf: response to a slowly stepped sine, for draws of the posterior
+input = "x"                       # where the force acts
+output = "x"                      # whose displacement is wanted
+levels = ["0.05 N", "0.2 N", "0.6 N"]
+band = ["17 Hz", "27 Hz"]
+samples = 50
+# harmonics = 7                   # the highest; by default as many as are needed
 '''
 
 
