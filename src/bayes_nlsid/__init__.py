@@ -37,6 +37,8 @@ _PUBLIC = {
     "WhittleLikelihood": "inference.likelihood", "sample": "inference.ensemble", "Posterior": "inference.posterior",
     # prediction
     "backbone_bands": "prediction.bands", "Bands": "prediction.bands", "heldout": "prediction.heldout", "Heldout": "prediction.heldout",
+    "response_curves": "prediction.continuation", "Curve": "prediction.continuation", "response_bands": "prediction.response_bands",
+    "ResponseBands": "prediction.response_bands",
     # whole studies
     "read_study": "study.reading", "run_study": "study.run", "Study": "study.schema",
 }

@@ -58,7 +58,7 @@ def test_turning_points_are_passed_and_sweeps_jump_there() -> None:
 
 
 def test_a_softening_curve_folds_the_other_way() -> None:
-    curve = response_curves(oscillator("cubic", zeta=0.01), [-4e4], drive="x", at="x", levels=[5.0], band=(7, 13))[0][0]
+    curve = response_curves(oscillator("cubic", zeta=0.01), [-4e4], drive="x", at="x", levels=[8.0], band=(7, 13))[0][0]
     grid = np.linspace(7.5, 12.5, 300)
     up, down = curve.swept("x", grid), curve.swept("x", grid, down=True)
     assert curve.status == "ok" and (down >= up * (1 - 1e-9)).all() and (down > 1.5 * up).any()

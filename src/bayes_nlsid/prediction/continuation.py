@@ -30,10 +30,12 @@ SPAN = 9.0
 ROUNDS = 9
 SETTLED = 1e-7
 SHARP = 0.85
-"""Smallest cosine between successive tangents; a sharper turn is taken in shorter steps."""
+"""Smallest cosine between successive tangents; a sharper turn is taken in shorter steps, down to a length at which it is a corner."""
+CORNER = 2e-3
 MOST_POINTS = 4000
 RAMPS, RAMP_STEPS = (0.02, 50.0), 16
 FLOOR = 0.02
+FAILED, FINER = "the corrector failed", 4
 
 
 @final
@@ -84,8 +86,10 @@ class Curve:
         return np.asarray(np.abs(self.coefficients[:, self.locations.index(location)] @ fine.T).max(axis=1))
 
     def peak(self, location: str) -> tuple[float, float]:
-        """Frequency (Hz) and fundamental amplitude (m) where the fundamental is largest, by a parabola along the curve."""
+        """Frequency (Hz) and fundamental amplitude (m) where the fundamental is largest, by a parabola along the curve; NaN without points."""
         size = np.abs(self.harmonic(location))
+        if not size.size:
+            return float("nan"), float("nan")
         i = int(np.argmax(size))
         if not 0 < i < len(size) - 1:
             return float(self.frequency[i]), float(size[i])
@@ -138,7 +142,7 @@ def response_curves(model: Model, theta: ArrayLike, *, drive: str, at: str, leve
     harmonics : int
         The highest; odd ones only where every force is odd.
     samples : int or None
-        Instants per period at which forces are evaluated.
+        Instants per period at which forces are evaluated; None: as the laws need, four times as many where that fails.
     most_points : int
         Points after which a curve is given up.
     progress : callable or None
@@ -158,18 +162,28 @@ def response_curves(model: Model, theta: ArrayLike, *, drive: str, at: str, leve
     if not (0 < band[0] < band[1] and np.isfinite(band).all()):
         raise ValueError(f"band {band} Hz must run from a positive frequency to a higher one")
     if force.ndim != 1 or not (np.isfinite(force).all() and (force > 0).all()):
-        raise ValueError(f"levels {levels} must be positive numbers of N")
+        raise ValueError(f"levels {force} must be positive numbers of N")
     if harmonics < 1:
         raise ValueError(f"harmonics must be at least 1, got {harmonics}")
     for name, what in ((drive, "driven"), (at, "observed")):
         if not np.any(model.linear.rows((name,))):
             raise ValueError(f"location {name!r} does not move in any mode, it cannot be {what}")
-    basis = Basis(orders_for(model, harmonics), samples or period_samples(model, harmonics))
     count = len(force)
     gain = model.gain(values)
     applied = np.tile(force, (len(values), 1)) * (1.0 if gain is None else gain[:, None])
-    system = _System(model, np.repeat(values, count, axis=0), applied.ravel(), drive, at, basis)
-    curves = [replace(curve, level=float(force[i % count])) for i, curve in enumerate(_Tracer(system, band, most_points).trace(progress))]
+    every, applied = np.repeat(values, count, axis=0), applied.ravel()
+
+    def trace(which: NDArray[np.intp], instants: int) -> list[Curve]:
+        basis = Basis(orders_for(model, harmonics), instants)
+        return _Tracer(_System(model, every[which], applied[which], drive, at, basis), band, most_points).trace(progress)
+
+    first = samples or period_samples(model, harmonics)
+    curves = trace(np.arange(len(every)), first)
+    failed = np.flatnonzero([curve.status.startswith(FAILED) for curve in curves]) if samples is None else np.zeros(0, dtype=np.intp)
+    if failed.size:  # at kinks a coarse period is jagged
+        for i, again in zip(failed, trace(failed, FINER * first), strict=True):
+            curves[i] = again
+    curves = [replace(curve, level=float(force[i % count])) for i, curve in enumerate(curves)]
     return [curves[i * count:(i + 1) * count] for i in range(len(values))]
 
 
@@ -195,7 +209,7 @@ class _System:
         omega, damping = self.omega[which, None], 2j * (self.zeta * self.omega)[which, None]
         hw = h * w[:, None, None]
         inverse = 1 / (omega**2 - hw**2 + damping * hw)
-        return inverse, inverse**2 * h * (2 * hw - damping)
+        return np.asarray(inverse), np.asarray(inverse**2 * h * (2 * hw - damping))
 
     def linear(self, w: Array, which: NDArray[np.intp]) -> Array:
         """Motion (B, L, C) without any element."""
@@ -233,9 +247,9 @@ class _System:
             out = out + np.einsum("blrij,brj->bli", between, force)
             by_w += np.einsum("blrij,brj->bli", self._blocks(slope), force) + np.einsum("blrij,brj->bli", between, by_omega)
             jacobian[:, :, :, :r] = (between @ by_x[:, None]).transpose(0, 1, 3, 2, 4)
-        jacobian = jacobian.reshape(batch, n, n)
-        jacobian[:, np.arange(n), np.arange(n)] += 1.0
-        return out.reshape(batch, n), jacobian, by_w.reshape(batch, n)
+        whole = jacobian.reshape(batch, n, n)
+        whole[:, np.arange(n), np.arange(n)] += 1.0
+        return out.reshape(batch, n), whole, by_w.reshape(batch, n)
 
 
 @final
@@ -252,7 +266,7 @@ class _Tracer:
         self.step = np.full(count, FIRST)
         self.peak = np.zeros((count, len(system.locations)))
         self.points: list[list[tuple[float, Array]]] = [[] for _ in range(count)]
-        self.status = np.full(count, "ok", dtype="<U48")
+        self.status = np.full(count, "ok", dtype="<U64")
         self.active = np.ones(count, dtype=bool)
 
     def trace(self, progress: Callable[[float], None] | None) -> list[Curve]:
@@ -357,13 +371,13 @@ class _Tracer:
             failed[part] = ~(size < 1.0) | (w[part] <= 0)
             open_[part] = ~(size <= SETTLED) & ~failed[part]
         turn = np.einsum("bi,bi->b", ahead, start)
-        good = ~open_ & ~failed & (turn > SHARP)
+        good = ~open_ & ~failed & ((turn > SHARP) | (self.step[which] < CORNER))
         self._accept(which[good], x[good], w[good], ahead[good], rounds[good], turn[good])
         short = which[~good]
         self.step[short] *= 0.4
         ended = short[self.step[short] < SHORTEST]
         for i in ended:
-            self.status[i] = f"the corrector failed at {self.w[i] / (2 * np.pi):.4g} Hz"
+            self.status[i] = f"{FAILED} at {self.w[i] / (2 * np.pi):.4g} Hz"
         self.active[ended] = False
 
     def _accept(self, which: NDArray[np.intp], x: Array, w: Array, ahead: Array, rounds: NDArray[np.int64], turn: Array) -> None:

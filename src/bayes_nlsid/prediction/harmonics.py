@@ -306,11 +306,9 @@ def orders_for(model: Model, highest: int) -> tuple[int, ...]:
 
 
 def period_samples(model: Model, highest: int) -> int:
-    """Instants per period: loops need more than smooth laws, and a jump several on its ramp."""
-    least = 128
+    """Instants per period: enough for kinks and loops, and for several on the ramp of a jump."""
+    least = 256
     for element in model.elements:
-        if element.term.memory == "masing":
-            least = max(least, 256)
         one = tuple(np.ones((1, 1)) for _ in element.term.params)
         if element.term.memory == "none" and jumps_of(element.term, one):
             least = 512

@@ -130,7 +130,7 @@ def response_bands(draws: ArrayLike | Drawable, model: Model, *, drive: str, at:
     level = np.atleast_1d(np.asarray(levels, dtype=float))
     told = progress if progress is not None else _silent
     told(0.0, "number of harmonics")
-    common = {"drive": drive, "at": at, "levels": level, "band": band}
+    common: dict[str, Any] = {"drive": drive, "at": at, "levels": level, "band": band}
     highest, error, middle = _enough_harmonics(model, np.median(theta, axis=0), harmonics, common)
     grid = _grid(middle, band)
     parts = [theta[i:i + CHUNK] for i in range(0, len(theta), CHUNK)]
@@ -160,7 +160,7 @@ def _chunk(shared: tuple[Model, dict[str, Any], Array], theta: Array) -> tuple[A
     every = response_curves(model, theta, **options)
     at, shape = options["at"], (len(theta), len(options["levels"]))
     up, down, peak = np.full((*shape, len(grid)), np.nan), np.full((*shape, len(grid)), np.nan), np.full((*shape, 2), np.nan)
-    ended = np.array([[_kind(curve.status) for curve in curves] for curves in every], dtype="<U48").reshape(shape)
+    ended = np.array([[_kind(curve.status) for curve in curves] for curves in every], dtype="<U64").reshape(shape)
     for s, curves in enumerate(every):
         for f, curve in enumerate(curves):
             if curve.status == "ok":
@@ -213,6 +213,7 @@ def _middle(peak: Array, ok: NDArray[np.bool_]) -> int:
     if not seen.any():
         return 0
     values = usable[:, seen]
-    distance = np.abs(values - np.nanmedian(values, axis=0)) / (np.nanstd(values, axis=0) + 1e-12 * np.nanmax(np.abs(values), axis=0) + 1e-300)
+    spread = np.nanstd(values, axis=0) + 1e-12 * np.nanmax(np.abs(values), axis=0) + 1e-300
+    distance = np.abs(values - np.nanmedian(values, axis=0)) / spread
     whole = np.isfinite(values).all(axis=1)
     return int(np.argmin(np.where(whole, np.nan_to_num(distance, nan=np.inf).mean(axis=1), np.inf)))
