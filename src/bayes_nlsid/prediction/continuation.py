@@ -86,7 +86,7 @@ class Curve:
         return np.asarray(np.abs(self.coefficients[:, self.locations.index(location)] @ fine.T).max(axis=1))
 
     def peak(self, location: str) -> tuple[float, float]:
-        """Frequency (Hz) and fundamental amplitude (m) where the fundamental is largest, by a parabola along the curve; NaN without points."""
+        """Frequency (Hz) and amplitude (m) where the fundamental is largest, by a parabola along the curve; NaN without points."""
         size = np.abs(self.harmonic(location))
         if not size.size:
             return float("nan"), float("nan")
