@@ -138,7 +138,7 @@ def parsed(entries: list[Dataset]) -> list[dict[str, Any]]:
     """
     import pyuff
 
-    text = "".join(f"    -1\n{e.kind:6d}\n" + "".join(f"{line[:80]:<80}\n" for line in _filled(e)) + "    -1\n" for e in entries)
+    text = "".join(f"    -1\n{e.kind:6d}\n" + "".join(f"{line[:80].rstrip()}\n" for line in _filled(e)) + "    -1\n" for e in entries)
     with tempfile.TemporaryDirectory(prefix="nlsid") as folder:
         path = Path(folder) / "headers.uff"
         path.write_text(text, encoding="utf-8")

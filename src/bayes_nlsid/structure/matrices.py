@@ -1,4 +1,4 @@
-"""Structures from matrices on disk: .npz archives and MatrixMarket pairs, with location rows from an archive, a table or TOML."""
+"""Structures from matrices on disk: .npz archives or files of finite-element programs, with rows of locations from a file of their own."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.structure.matrix_files import SEVERAL, FileMatrix, converted, matched, read_matrix, without_massless
 from bayes_nlsid.structure.structure import Matrix, Structure
 
 ROLES = ("sensors", "inputs", "joints", "other")
@@ -19,20 +20,23 @@ ROLES = ("sensors", "inputs", "joints", "other")
 
 def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping: str | Path | None = None, *,
                   locations: str | Path | None = None, joints: Sequence[str] | None = None, sensors: Sequence[str] | None = None,
-                  inputs: Sequence[str] | None = None) -> Structure:
+                  inputs: Sequence[str] | None = None, length_unit: str | None = None, force_unit: str | None = None,
+                  rotations: Sequence[str] | None = None, mass_name: str | None = None, stiffness_name: str | None = None,
+                  damping_name: str | None = None) -> Structure:
     """A structure from files.
 
     Parameters
     ----------
     mass : path
-        An ``.npz`` archive, or the mass matrix in MatrixMarket format (``.mtx``), symmetric ones stored by one triangle or in full.
+        An ``.npz`` archive in SI, or the mass matrix as MatrixMarket or Abaqus ``.mtx``, Harwell–Boeing (``.hb``, ``.rb``, ``.rsa``,
+        ``.rua``), Nastran OUTPUT4 (``.op4``) or DMIG (``.pch``, ``.dmig``, ``.bdf``); symmetric ones by one triangle or in full.
 
         Archive: ``M``, ``K`` (N, N), optional ``C``; ``K_parts`` (P, N, N) with ``K_part_names`` (P,), ``M_parts`` likewise;
         ``dof_names`` (N,); ``location_names`` (L,) with ``location_vectors`` (L, N); ``sensor_select`` (s, N), which become S1..Ss;
         ``shaker_vector`` (N,), which becomes the input SHAKER; ``base_vector`` (N,), rigid motion with the base, whose row BASE is
         M times it: with acceleration of the base it gives minus the force on the structure, kg.
     stiffness, damping : path
-        MatrixMarket files that belong to a mass in that format.
+        Files that belong to the mass; a Nastran file may hold all of them.
     locations : path, optional
         ``.npz`` with ``location_names`` and ``location_vectors``; ``.csv`` with columns name, dof, coefficient and optionally role
         (repeated names add up; dof is a name or a number from 1); ``.toml`` with tables ``[[location]]`` of name, dofs,
@@ -40,6 +44,18 @@ def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping
     joints, sensors, inputs : sequence of str, optional
         Which locations have these roles; by default those the files say, and for joints every location called ``J<number>...``,
         ``ROOT...`` or ``TIP...`` of an archive.
+    length_unit, force_unit : str, optional
+        Consistent units of the files with the second, for instance ``"mm"`` and ``"N"`` (masses in t). MatrixMarket counts as SI without
+        them; the formats of finite-element programs need them.
+    rotations : sequence of str, optional
+        Degrees of freedom that are angles, where the format does not say it and the length is not in m.
+    mass_name, stiffness_name, damping_name : str, optional
+        Which matrix of a Nastran file; by default the only one whose name begins with M, K, B or C.
+
+    Notes
+    -----
+    Held degrees of freedom of Abaqus (1e36 on the diagonal) are left out; those without any mass are condensed, which is exact.
+    Coefficients of locations are SI.
 
     Raises
     ------
@@ -48,13 +64,17 @@ def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping
         is unknown.
     """
     path = Path(mass)
+    units = (length_unit, force_unit)
     if path.suffix == ".npz":
-        archive = _archive(path)
-        content = _from_archive(path, archive)
+        if any(units):
+            raise InputError(str(path), "units are given, but an archive is in SI", "convert it, and leave length_unit and force_unit out")
+        content = _from_archive(path, _archive(path))
     else:
-        content = _from_market(path, stiffness, damping)
+        called = {"mass": mass_name, "stiffness": stiffness_name, "damping": damping_name}
+        content = _from_files(path, {"stiffness": stiffness, "damping": damping}, called, units, rotations)
     if locations is not None:
         _add_locations(Path(locations), content)
+    content.condense()
     for role, names in (("joints", joints), ("sensors", sensors), ("inputs", inputs)):
         if names is not None:
             unknown = [n for n in names if n not in content.rows]
@@ -64,7 +84,7 @@ def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping
     try:
         return Structure(content.M, content.K, content.dofs, content.rows, sensors=tuple(content.roles["sensors"]),
                          inputs=tuple(content.roles["inputs"]), joints=tuple(content.roles["joints"]), C=content.C,
-                         K_parts=content.K_parts, M_parts=content.M_parts, notes=(f"matrices read from {path.name}",))
+                         K_parts=content.K_parts, M_parts=content.M_parts, notes=(f"matrices read from {path.name}{content.said}",))
     except ValueError as error:
         raise InputError(str(path), str(error), "export the matrices again, complete and in one set of SI units") from error
 
@@ -79,6 +99,17 @@ class _Content:
         self.roles: dict[str, list[str]] = {role: [] for role in ROLES}
         self.K_parts: dict[str, Matrix] = {}
         self.M_parts: dict[str, Matrix] = {}
+        self.said = ""
+        self.condensable = False
+
+    def condense(self) -> None:
+        """Leave out degrees of freedom that have no mass, where the matrices are those of a finite-element program."""
+        if not self.condensable:
+            return
+        given = {"mass": self.M, "stiffness": self.K, **({} if self.C is None else {"damping": self.C})}
+        found, self.dofs, self.rows, count = without_massless(given, self.dofs, self.rows)
+        self.M, self.K, self.C = found["mass"], found["stiffness"], found.get("damping")
+        self.said += f"; {count} degrees of freedom without mass were condensed" if count else ""
 
     def add(self, where: str, name: str, row: NDArray[np.float64], role: str) -> None:
         """One location; a name may be given again only for another role with the same row."""
@@ -146,27 +177,26 @@ def _parts(path: Path, archive: dict[str, NDArray[Any]], letter: str, n: int) ->
     return {name: np.asarray(part, dtype=float) for name, part in zip(names, stack, strict=True)}
 
 
-def _from_market(mass: Path, stiffness: str | Path | None, damping: str | Path | None) -> _Content:
-    if stiffness is None:
+def _from_files(mass: Path, others: dict[str, str | Path | None], names: dict[str, str | None], units: tuple[str | None, str | None],
+                rotations: Sequence[str] | None) -> _Content:
+    """Matrices of one model from the files of a finite-element program, in SI."""
+    if others["stiffness"] is None and mass.suffix.lower() not in SEVERAL:
         raise InputError(str(mass), "a mass matrix alone is no structure", "name the stiffness matrix too, or an .npz archive with M and K")
-    M, K = _market(mass), _market(Path(stiffness))
-    C = None if damping is None else _market(Path(damping))
-    if M.shape != K.shape or M.shape[0] != M.shape[1]:
-        raise InputError(f"{mass}, {stiffness}", f"sizes {M.shape} and {K.shape} differ or are not square", "export both from one model")
-    return _Content(M, K, C, tuple(f"q{i + 1}" for i in range(M.shape[0])))
-
-
-def _market(path: Path) -> Matrix:
-    """One matrix; a triangle marked ``symmetric`` is completed, sparse ones stay sparse."""
-    from scipy.io import mmread
-    from scipy.sparse import csr_array, issparse
-
-    try:
-        matrix = mmread(path)
-    except (OSError, ValueError, IndexError) as error:
-        mend = "check the header line and the number of entries"
-        raise InputError(str(path), f"cannot be read as MatrixMarket ({error})", mend) from error
-    return csr_array(matrix, dtype=float) if issparse(matrix) else np.asarray(matrix, dtype=float)
+    first = read_matrix(mass, "mass", names["mass"])
+    found: dict[str, FileMatrix] = {
+        "mass": first, "stiffness": read_matrix(Path(others["stiffness"] or mass), "stiffness", names["stiffness"])}
+    if others["damping"] is not None or names["damping"] is not None:
+        found["damping"] = read_matrix(Path(others["damping"] or mass), "damping", names["damping"])
+    length, force = units
+    if (length is None or force is None) and not (length is force is None and all(f.si_already for f in found.values())):
+        raise InputError(f"{mass}: {'length_unit' if length is None else 'force_unit'}", f"a file of {first.form} does not say its units",
+                         'write length_unit = "mm" and force_unit = "N" for a model in mm, N, t and s, or "m" and "N" for SI')
+    where = f"{mass}, {others['stiffness'] or mass.name}"
+    matrices, dofs = matched(found, where)
+    matrices = converted(matrices, dofs, length or "m", force or "N", rotations, str(mass))
+    content = _Content(matrices["mass"], matrices["stiffness"], matrices.get("damping"), dofs)
+    content.said, content.condensable = f" ({first.form}; in {length or 'm'}, {force or 'N'} and s, converted to SI)", True
+    return content
 
 
 def _add_locations(path: Path, content: _Content) -> None:

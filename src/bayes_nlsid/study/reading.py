@@ -49,7 +49,7 @@ def read_study(path: Path | str) -> Study:
     reduction = read_reduction(top.table("reduction"), structure)
     terms = read_terms(top)
     recordings = _read_recordings(top, locations)
-    linear = _read_linear(top.table("linear"), recordings)
+    linear = _read_linear(top.table("linear"), recordings, locations)
     identification = read_identification(top.table("identification"), locations, terms)
     posterior = read_posterior(top.table("posterior"))
     names = tuple(r.name for r in recordings)
@@ -58,7 +58,8 @@ def read_study(path: Path | str) -> Study:
     frf = read_frf(top.table("frf"), locations)
     top.close()
     _check_order(file, identification is not None, {"posterior": posterior, "prediction": prediction, "frf": frf}, recordings)
-    files = dict.fromkeys([*(p for _, p in structure.files), *(Path(r.file) for r in recordings)])
+    others = [linear.file] if linear.file else []
+    files = dict.fromkeys([*(p for _, p in structure.files), *others, *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
     return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
                  report, frf, locations, ((file.name, file_digest(file)), *inputs))
@@ -188,7 +189,23 @@ def _read_update(table: Table) -> tuple[tuple[str, tuple[str, ...]], ...]:
     return () if inner is None else tuple((key, inner.texts(key)) for key in inner.keys())
 
 
-def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec]) -> LinearEntry:
+def _read_modal_test(table: Table, recording: str | None, locations: Sequence[str]) -> tuple[Path | None, tuple[tuple[str, str], ...]]:
+    """``file`` with modes that another program found, and ``[linear.sensors]``: location = name in that file."""
+    file, inner = table.path("file", None), table.table("sensors")
+    sensors = () if inner is None else tuple((key, inner.text(key)) for key in inner.keys())
+    if file is not None and recording is not None:
+        raise table.wrong("file", "is given beside recording", "keep one of them: modes come from one source")
+    unknown = [name for name, _ in sensors if name not in locations]
+    if unknown:
+        raise table.wrong("sensors", f"{unknown[0]!r} is not a location of the structure", nearest(unknown[0], locations))
+    if file is not None:
+        from bayes_nlsid.structure.modal_results import read_modal_results
+
+        read_modal_results(file, locations, dict(sensors))
+    return file, sensors
+
+
+def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec], locations: Sequence[str]) -> LinearEntry:
     if table is None:
         return LinearEntry()
     names = [r.name for r in recordings]
@@ -196,10 +213,11 @@ def _read_linear(table: Table | None, recordings: Sequence[RecordingSpec]) -> Li
     if recording is not None and recording not in names:
         raise table.wrong("recording", f"there is no recording {recording!r}", nearest(recording, names))
     update = _read_update(table)
+    file, sensors = _read_modal_test(table, recording, locations)
     entry = LinearEntry(recording, table.span("window", "time", None), table.integers("modes", ()), update,
-                        table.numbers("damping", "ratio", ()), table.flag("use_measured", True))
-    if update and recording is None:
-        raise table.wrong("update", "names parts to update, but no recording to take modes from", 'add recording = "name"')
+                        table.numbers("damping", "ratio", ()), table.flag("use_measured", True), file, sensors)
+    if update and recording is None and file is None:
+        raise table.wrong("update", "names parts to update, but no recording to take modes from", 'add recording = "name" or file = "..."')
     if any(not 0 < z < 1 for z in entry.damping):
         raise table.wrong("damping", f"{list(entry.damping)} holds a ratio outside 0 to 1", 'write ratios such as 0.001 or "0.1 %"')
     table.close()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.recordings.units import unit_factor
 from bayes_nlsid.structure.beam import LappedBeam
 from bayes_nlsid.study.building import build_structure
 from bayes_nlsid.study.schema import ReductionEntry, StructureEntry
@@ -101,15 +102,25 @@ def _positions(table: Table, name: str) -> tuple[tuple[str, float], ...]:
 
 
 def _matrices(table: Table) -> StructureEntry:
-    """``mass`` names an npz archive of everything, or the MatrixMarket file that ``stiffness`` belongs to."""
+    """``mass`` names an npz archive of everything, or the file of a finite-element program that ``stiffness`` belongs to."""
+    from bayes_nlsid.structure.matrix_files import SEVERAL
+
     files: list[tuple[str, Path]] = [("mass", table.path("mass"))]
-    archive = files[0][1].suffix == ".npz"
+    complete = files[0][1].suffix.lower() in (".npz", *SEVERAL)
     for key in ("stiffness", "damping", "locations"):
         if table.has(key):
             files.append((key, table.path(key)))
-    if not archive and len(files) == 1:
+    if not complete and "stiffness" not in dict(files):
         raise table.wrong("stiffness", "is missing", "name the stiffness matrix that goes with mass, or give one npz archive as mass")
-    values = {key: table.texts(key, None) for key in GROUPS}
+    values: dict[str, Any] = {key: table.texts(key, None) for key in GROUPS}
+    values |= {key: table.text(key, None) for key in ("length_unit", "force_unit", "mass_name", "stiffness_name", "damping_name")}
+    rotations = table.items("rotations", None)
+    values["rotations"] = None if rotations is None else tuple(map(str, rotations))
+    for key, dimension in (("length_unit", "displacement"), ("force_unit", "force")):
+        try:
+            unit_factor(values[key] or {"displacement": "m", "force": "N"}[dimension], dimension)
+        except InputError as error:
+            raise table.wrong(key, f"{values[key]!r} {error.problem}", error.mend) from None
     return StructureEntry("matrices", tuple((k, v) for k, v in values.items() if v is not None), tuple(files))
 
 

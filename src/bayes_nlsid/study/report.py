@@ -73,19 +73,24 @@ def _recordings(report: Report) -> str:
     rows, findings = [], []
     for record in saved.data["recordings"]:
         for channel in record["channels"]:
-            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s",
-                         f"{record['rate']:.6g} Hz",
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], _units(channel),
+                         f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
                          f"{channel['peak']:.3g} {unit_sign(channel['unit'])}", f"{channel['noise_rms']:.2g} {unit_sign(channel['unit'])}"])
         for channel in record["inputs"]:
-            rows.append([record["name"], record["role"], channel["name"], channel["location"], f"{record['seconds']:.3g} s",
-                         f"{record['rate']:.6g} Hz",
+            rows.append([record["name"], record["role"], channel["name"], channel["location"], _units(channel),
+                         f"{record['seconds']:.3g} s", f"{record['rate']:.6g} Hz",
                          f"{channel['peak']:.3g} N", "–"])
         findings += [f"{record['name']}, {f['channel']}: {f['sentence']}" if f["channel"] else f"{record['name']}: {f['sentence']}"
                      for f in record["findings"]]
-    head = ["recording", "role", "channel", "location", "length", "rate", "peak", "noise (rms)"]
+    head = ["recording", "role", "channel", "location", "unit in the file → here", "length", "rate", "peak", "noise (rms)"]
     how = list(dict.fromkeys(f"Noise floor: {r['noise']}" for r in saved.data["recordings"]))
     said = "".join(html.paragraph(sentence, "soft") for sentence in how[:3])
-    return html.table(head, rows, "stages/read", numeric=(4, 5, 6, 7)) + html.listing(findings) + said
+    return html.table(head, rows, "stages/read", numeric=(5, 6, 7, 8)) + html.listing(findings) + said
+
+
+def _units(channel: Mapping[str, Any]) -> str:
+    """``g → m/s²``: what the file holds and what it was converted to, once."""
+    return f"{unit_sign(channel.get('file_unit') or '?')} → {unit_sign(channel['unit'])}"
 
 
 def _linear(report: Report) -> str:

@@ -47,7 +47,8 @@ class LinearEntry:
     """``[linear]``: where modes are measured and which parts of the structure are updated to them.
 
     ``modes`` are 1-based; ``update`` names parts of the structure, or groups of parts that share one factor; ``damping`` overrides what
-    is measured, mode by mode; ``use_measured`` puts the measured frequencies into the model for identification.
+    is measured, mode by mode; ``use_measured`` puts the measured frequencies into the model for identification. ``file`` holds modes that
+    a test program found, in place of a recording; ``sensors`` are names in that file by location.
     """
 
     recording: str | None = None
@@ -56,6 +57,8 @@ class LinearEntry:
     update: tuple[tuple[str, tuple[str, ...]], ...] = ()
     damping: tuple[float, ...] = ()
     use_measured: bool = True
+    file: Path | None = None
+    sensors: tuple[tuple[str, str], ...] = ()
 
 
 @final

@@ -91,7 +91,7 @@ def plan(study: Study) -> str:
         parts.append(f"prediction: backbone of mode {p.mode} at {p.at} from {engineering(p.amplitude, 'm')}, {p.samples} samples; "
                      f"held out: {', '.join(p.heldout) or 'none'}")
     missing = [text for given, text in (
-        (study.linear.recording, "no low-level recording under [linear]: the linear model is used as stated"),
+        (study.linear.recording or study.linear.file, "no low-level recording under [linear]: the linear model is used as stated"),
         (study.identification, "no [identification]: only the linear model is made"),
         (study.posterior, "no [posterior]: best values without uncertainty"),
         (study.prediction and study.prediction.heldout, "no held-out record under [prediction]: nothing tests the prediction"))

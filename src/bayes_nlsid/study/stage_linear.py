@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.recording import Recording
+from bayes_nlsid.structure.identified import IdentifiedModes
 from bayes_nlsid.structure.modal import ModalModel
 from bayes_nlsid.structure.structure import Structure, mac
 from bayes_nlsid.study.building import build_structure, model_record, reduce_structure
@@ -29,20 +30,17 @@ def linear(context: Context) -> Result:
     context.progress(0.0, "building the structure")
     structure = build_structure(study.structure)
     nominal = reduce_structure(structure, study.reduction)
-    if study.linear.recording is None:
+    if study.linear.recording is None and study.linear.file is None:
         model = _with_stated_damping(context, nominal)
         arrays, names = model_record(model)
         notes = [*model.notes, "no low-level recording was named"]
         return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": notes}
-    from bayes_nlsid.structure.identify import identify_modes
     from bayes_nlsid.structure.polarity import polarity
 
-    context.progress(0.2, "identifying modes from low-level data")
     wanted = tuple(k - 1 for k in study.linear.modes) or tuple(range(nominal.modes))
-    recording = _low_level(context)
-    measured = identify_modes(recording, nominal, modes=wanted)
+    measured, source = _measured(context, nominal, wanted)
     signs = [{"channel": f.channel, "sentence": f.sentence} for f in polarity(measured, nominal)]
-    missing = [f"mode {k + 1}, {nominal.frequency[k]:.4g} Hz in the model, was not found in recording {recording.name!r}: it was not "
+    missing = [f"mode {k + 1}, {nominal.frequency[k]:.4g} Hz in the model, was not found in {source}: it was not "
                "excited, or the model is more than 10 % off" for k in wanted if k not in measured.nominal]
     for sentence in missing:
         context.note(sentence)
@@ -58,7 +56,25 @@ def linear(context: Context) -> Result:
     if study.structure.kind == "beam" and table:
         arrays |= _shape_lines(context, updated, [row["number"] - 1 for row in table])
     return arrays, {"model": names, "modes": table, "polarity": signs, "updated": updated, "shape_locations": list(measured.locations),
-                    "notes": [*model.notes, *measured.notes, *missing, *notes], "recording": recording.name}
+                    "notes": [*model.notes, *measured.notes, *missing, *notes], "recording": study.linear.recording or ""}
+
+
+def _measured(context: Context, nominal: ModalModel, wanted: tuple[int, ...]) -> tuple[IdentifiedModes, str]:
+    """Modes from the low-level recording or from the file of a modal test, and what to call that source."""
+    entry = context.study.linear
+    if entry.file is not None:
+        from bayes_nlsid.structure.modal_results import matched_to, read_modal_results
+
+        found = matched_to(read_modal_results(entry.file, nominal.locations, dict(entry.sensors)), nominal, wanted)
+        if not found.modes:
+            raise InputError(f"{context.study.file.name}: [linear] file", f"no mode of {entry.file.name} is near one of the model",
+                             "check the frequencies of the model, or leave the file out")
+        return found, f"file {entry.file.name!r}"
+    from bayes_nlsid.structure.identify import identify_modes
+
+    context.progress(0.2, "identifying modes from low-level data")
+    recording = _low_level(context)
+    return identify_modes(recording, nominal, modes=wanted), f"recording {recording.name!r}"
 
 
 def _updated(context: Context, structure: Structure | ModalModel, measured: Any) -> tuple[Any, list[dict[str, Any]], list[str]]:

@@ -43,7 +43,7 @@ def _describe(recording: Recording, noise: Any, how: str) -> dict[str, Any]:
     channels = [{"name": c.name, "location": c.location, "quantity": c.quantity, "unit": SI_UNIT[c.quantity], "file_unit": c.unit,
                  "polarity": c.polarity, "rms": float(np.std(recording.response[:, k])), "peak": float(peaks[k]),
                  "noise_rms": float(noise[k])} for k, c in enumerate(recording.channels)]
-    inputs = [{"name": c.name, "location": c.location, "unit": "N", "rms": float(np.std(recording.force[:, k])),
+    inputs = [{"name": c.name, "location": c.location, "unit": "N", "file_unit": c.unit, "rms": float(np.std(recording.force[:, k])),
                "peak": float(np.abs(recording.force[:, k]).max())} for k, c in enumerate(recording.inputs)]
     findings = [{"severity": f.severity, "channel": f.channel, "sentence": f.sentence} for f in check(recording)]
     return {"name": recording.name, "role": recording.role, "rate": recording.fs, "seconds": recording.n * recording.dt,
