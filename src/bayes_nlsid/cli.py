@@ -161,10 +161,12 @@ def _extra(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.checking import examine
     from bayes_nlsid.study.reading import read_study
     from bayes_nlsid.study.screen import plan
 
-    print(plan(read_study(options.study)))
+    study = read_study(options.study)
+    print(plan(study, examine(study)))
     return DONE
 
 

@@ -260,6 +260,20 @@ def test_draws_at_a_bound_are_told():
     assert found.status == "not_identifiable" and "at a bound" in found.reasons[0]
 
 
+def test_a_parameter_spread_over_a_decade_is_not_called_determined():
+    s = np.random.default_rng(0).normal(size=(4, 2000, 20, 2)) * np.array([0.4, 0.1])   # log10: 90 % within ± 0.66 and ± 0.16
+    found = judge(s, logarithmic=[True, True])
+    assert found.identifiable.tolist() == [False, True] and found.status == "not_identifiable"
+    assert found.reasons == (f"p0 is known only to within a factor of {10 ** (2 * 1.645 * 0.4):.2g} between its 5 % and 95 % points",)
+    assert judge(s, logarithmic=[False, False]).identifiable.all()
+
+
+def test_walkers_replaced_before_sampling_do_not_spoil_what_came_after():
+    s = ar1(0.5, (4, 2000, 20, 2), np.random.default_rng(0))
+    assert judge(s, redrawn=30).converged and judge(s, redrawn=30).stuck_walkers == 30
+    assert not judge(s, redrawn=41).converged
+
+
 # -- storage ------------------------------------------------------------------------------------------------------------------------
 
 

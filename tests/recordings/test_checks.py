@@ -43,13 +43,13 @@ def sweep(rng: np.random.Generator) -> Signal:
 CLEAN: tuple[Callable[[np.random.Generator], Signal], ...] = (multisine, decay, noise, sine, sweep)
 
 
-def found(x: Signal, role: Role = "train", quantity: str = "acceleration") -> tuple[Finding, ...]:
+def found(x: Signal, role: Role = "holdout", quantity: str = "acceleration") -> tuple[Finding, ...]:
     columns = x.reshape(len(x), -1)
     channels = tuple(Channel(f"S{i}", f"S{i}", quantity, "") for i in range(columns.shape[1]))  # type: ignore[arg-type]
     return check(Recording("run", 1 / FS, columns, channels, np.zeros((len(x), 0)), role=role))
 
 
-def kinds(x: Signal, role: Role = "train") -> set[str]:
+def kinds(x: Signal, role: Role = "holdout") -> set[str]:
     return {f.kind for f in found(x, role)}
 
 
@@ -160,3 +160,12 @@ def test_too_short_and_order_of_findings() -> None:
     x[:, 0] += 5 * x[:, 0].std()
     x[:, 1] = np.clip(x[:, 1], -1, 1)
     assert [f.severity for f in found(x)] == ["error", "note"]
+
+
+def test_motion_that_goes_on_without_a_force_is_told() -> None:
+    rng = np.random.default_rng(0)
+    told = [{f.kind for f in found(make(rng), role="train")} for make in (multisine, noise, sine, decay)]
+    assert told == [{"driven"}] * 3 + [set()]
+    force = (Channel("F", "S0", "force", "N"),)
+    x = multisine(rng)[:, None]
+    assert check(Recording("run", 1 / FS, x, (Channel("S0", "S0", "acceleration", ""),), x, force)) == ()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bayes_nlsid.recordings.noise import NoiseFloor, noise_psd, quiet_stretch
+from bayes_nlsid.recordings.noise import NoiseFloor, as_stated, noise_psd, quiet_stretch
 from bayes_nlsid.recordings.recording import Channel, Recording
 
 FS = 2048.0
@@ -97,3 +97,33 @@ def test_misuse_is_named() -> None:
         noise_psd(record(white(8, 1, 1)))
     with pytest.raises(ValueError, match="must ascend"):
         noise_psd(record(white(1024, 1, 1), role="noise")).rms((5.0, 2.0))
+
+
+def test_from_what_repeats_in_a_noise_record() -> None:
+    """130 samples of a period of 4096 come a second time: what differs is noise, whatever the signal."""
+    n = 4096
+    signal = 100 * np.random.default_rng(2).normal(size=(n, 2))
+    twice = record(np.concatenate([signal, signal[:130]]) + white(n + 130, 0.2, 3), "again", "noise", n)
+    floor = noise_psd(record(signal), twice)
+    assert floor.sure == "measured" and "130 samples" in floor.how
+    assert np.all(np.abs(floor.rms() / 0.2 - 1) < 0.2)
+    with pytest.raises(ValueError, match="hold no 32 that repeat"):
+        record(signal, role="noise", period=n)
+
+
+def test_a_sweep_without_a_quiet_part_is_judged_by_the_quietest_part_of_its_spectrum() -> None:
+    t = np.arange(2**14) / FS
+    sweep = np.sin(2 * np.pi * (10 * t + 15 * t**2))[:, None] * np.ones(2)  # 10 to 250 Hz
+    plain = record(sweep + white(len(t), 0.01, 5))
+    forced = Recording(plain.name, plain.dt, plain.response, plain.channels, sweep[:, :1], (Channel("F", "S0", "force", "N"),))
+    floor = noise_psd(forced)
+    assert floor.sure == "bound" and "quietest quarter" in floor.how
+    assert np.all(np.abs(floor.rms() / 0.01 - 1) < 0.25)
+    assert np.all(noise_psd(plain).rms() > 0.1), "without the rule the sweep itself is taken for noise"
+
+
+def test_noise_stated_for_some_channels() -> None:
+    floor = noise_psd(record(white(4096, 0.3, 1), role="noise"))
+    stated = as_stated(floor, [0.05, None])
+    assert stated.rms() == pytest.approx([0.05, floor.rms()[1]]) and "S0 as stated" in stated.how
+    assert as_stated(floor, [0.0, 0.0]).rms().tolist() == [0.0, 0.0] and as_stated(floor, [None, None]) is floor

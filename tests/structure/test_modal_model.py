@@ -29,7 +29,7 @@ def test_measured_damping_goes_to_the_modes_it_belongs_to() -> None:
     plain = modal_model(CHAIN, 4)
     model = modal_model(CHAIN, 4, zeta=measured([0, 2]))
     np.testing.assert_allclose(model.zeta, [0.01, 1e-3, 0.02, 1e-3])
-    np.testing.assert_allclose(model.zeta_sd, [0.1, 0, 0.1, 0])
+    np.testing.assert_allclose(model.zeta_sd, [0.1, 1, 0.1, 1])  # the others are assumed
     np.testing.assert_allclose(model.omega, plain.omega)
     moved = modal_model(CHAIN, 4, zeta=measured([0, 2]), measured_frequencies=True)
     np.testing.assert_allclose(moved.omega / plain.omega, [1.02, 1, 1.02, 1])

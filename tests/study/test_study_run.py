@@ -17,6 +17,7 @@ from bayes_nlsid.errors import InputError
 from bayes_nlsid.study.progress import Reporter, duration
 from bayes_nlsid.study.reading import read_study
 from bayes_nlsid.study.run import rebuild_report, run_study
+from bayes_nlsid.study.template import TEXT
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
@@ -27,6 +28,14 @@ def finished(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("finished") / "out"
     run_study(read_study(small), out)
     return out
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures, where only stages and numbers are looked at."""
+    from bayes_nlsid.study import pictures
+
+    monkeypatch.setattr(pictures, "draw_all", lambda *_: [])
 
 
 def timeless(out: Path) -> dict[str, Any]:
@@ -59,7 +68,7 @@ def test_contract_files(finished: Path) -> None:
     assert len(list((finished / "figures").glob("*.png"))) >= 2
 
 
-def test_second_run_computes_nothing(small: Path, finished: Path, tmp_path: Path) -> None:
+def test_second_run_computes_nothing(small: Path, finished: Path, quick: None, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     (out / "run.log").unlink()
@@ -74,7 +83,8 @@ def test_second_run_computes_nothing(small: Path, finished: Path, tmp_path: Path
     ("zeta = 0.011", "zeta = 0.012", 1),
     ("window = [0.0, 4.0]", "window = [0.0, 3.0]", 0),
 ])
-def test_only_what_depends_on_a_change_is_redone(right: str, wrong: str, reused: int, small: Path, finished: Path, tmp_path: Path) -> None:
+def test_only_what_depends_on_a_change_is_redone(right: str, wrong: str, reused: int, small: Path, finished: Path, quick: None,
+                                                   tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     (out / "run.log").unlink()
@@ -86,7 +96,7 @@ def test_only_what_depends_on_a_change_is_redone(right: str, wrong: str, reused:
     assert log_of(out).count("taken from an earlier run") == reused, log_of(out)
 
 
-def test_another_seed_redoes_what_draws(small: Path, finished: Path, tmp_path: Path) -> None:
+def test_another_seed_redoes_what_draws(small: Path, finished: Path, quick: None, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     (out / "run.log").unlink()
@@ -117,7 +127,7 @@ run.run_study(read_study(sys.argv[1]), Path(sys.argv[2]))
 
 @pytest.mark.parametrize("stage", [pytest.param("read", marks=pytest.mark.slow), "linear", pytest.param("identify", marks=pytest.mark.slow),
                                    "report"])
-def test_kill_and_resume_gives_the_same_numbers(stage: str, small: Path, finished: Path, tmp_path: Path) -> None:
+def test_kill_and_resume_gives_the_same_numbers(stage: str, small: Path, finished: Path, quick: None, tmp_path: Path) -> None:
     out = tmp_path / "out"
     killed = subprocess.run([sys.executable, "-c", KILLER, str(small), str(out), stage], env=ENVIRONMENT, check=False)
     assert killed.returncode == -9
@@ -131,7 +141,7 @@ def test_kill_and_resume_gives_the_same_numbers(stage: str, small: Path, finishe
                 np.testing.assert_array_equal(a[key], b[key])
 
 
-def test_interrupt_keeps_finished_stages(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_keeps_finished_stages(small: Path, quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from bayes_nlsid.study import run
 
     real = run._stage
@@ -281,3 +291,28 @@ def test_the_exported_posterior_is_the_one_that_was_sampled(sampled: Path, tmp_p
     rows = {p["name"]: p for p in json.loads((tmp_path / "result.json").read_text())["parameters"]}
     middle = float(np.median(data.posterior["f[1]"].values))
     assert middle == pytest.approx(rows["f[1]"]["q50"], rel=1e-12)
+
+
+def test_the_noise_of_a_sensor_comes_from_the_best_evidence(recording: Path, tmp_path: Path) -> None:
+    """A noise record serves whatever its channels are called; without one, what scatters between periods elsewhere does."""
+    from bayes_nlsid.study.context import Context
+
+    text = recording.parent.joinpath("best.toml")
+    base = TEXT[:TEXT.index("[identification]")]
+    text.write_text(base.replace('array = "quiet"\n', 'array = "quiet"\nname = "the same sensor"\n'), encoding="utf-8")
+    context = Context(read_study(text), 1)
+    assert "from the recording 'quiet'" in context.noise(context.recordings["multisine"]).how
+    periodic = base[:base.index("[[recordings]]\nname = \"quiet\"")].replace("window = [0.0, 8.0] ", "period = 1024\nwindow = [0.0, 8.0] ")
+    text.write_text(periodic, encoding="utf-8")
+    context = Context(read_study(text), 1)
+    assert "as in the recording 'multisine', from the differences between 8" in context.noise(context.recordings["later part"]).how
+    text.write_text(base.replace('unit = "m/s^2"\nlocation', 'unit = "m/s^2"\nnoise = "2 mm/s^2"\nlocation', 1), encoding="utf-8")
+    context = Context(read_study(text), 1)
+    assert context.noise(context.recordings["multisine"]).rms() == pytest.approx([2e-3])
+
+
+def test_a_frequency_at_its_bound_is_a_refusal(small: Path, quick: None, tmp_path: Path) -> None:
+    far = small.with_name("far.toml")
+    far.write_text(small.read_text(encoding="utf-8").replace('frequency = "20 Hz"', 'frequency = "35 Hz"'), encoding="utf-8")
+    result = run_study(read_study(far), tmp_path / "out")
+    assert result["status"] == "not_identifiable" and any("f[1] ended at a bound" in reason for reason in result["reasons"])

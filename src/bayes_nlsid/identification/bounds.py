@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from bayes_nlsid.forces.term import Term
 from bayes_nlsid.identification.observed import Observed
 from bayes_nlsid.model import Element, Model
+from bayes_nlsid.structure.modal import ASSUMED
 
 FREQUENCY, DAMPING = 0.05, 0.20   # half widths of Section 2.2
+GUESS = 30.0                      # a damping ratio that was only assumed lies within this factor
 GAIN = 1.5                        # an unknown gain of the force lies within this factor of 1
 LEVERAGE_FLOOR = 0.1              # of the largest leverage among the locations of an element
 MOTION_FLOOR = 0.01               # of the largest motion among them
@@ -20,8 +22,8 @@ MOTION_FLOOR = 0.01               # of the largest motion among them
 def bounds(model: Model, observed: Observed, widening: float, linear_widening: tuple[float, float]) -> NDArray[np.float64]:
     """Bounds (P, 2) of theta.
 
-    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``; a gain of the force between 1/1.5
-    and 1.5. The largest force at a location
+    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``; a damping ratio that was neither
+    measured nor stated within a factor of 30; a gain of the force between 1/1.5 and 1.5. The largest force at a location
     is the one whose modal force equals the linear modal forces (inertia + damping + stiffness, each at its largest), over the fitted
     equations in the root-sum-square sense: F_l = ‖L‖ / ‖b_l‖. For one equation this is the paper's rule. A location that hardly
     moves or hardly acts on the fitted equations (the middle joint in mode 1) would get an infinite bound: its leverage and motion
@@ -56,7 +58,8 @@ def bounds(model: Model, observed: Observed, widening: float, linear_widening: t
             damping = parameter.name.startswith("zeta")
             nominal = (model.linear.zeta if damping else model.linear.frequency)[parameter.mode]
             half = DAMPING * linear_widening[1] if damping else FREQUENCY * linear_widening[0]
-            out[i] = nominal * np.maximum(1 + half * sides, 0.01)
+            guessed = damping and model.linear.zeta_sd[parameter.mode] >= ASSUMED
+            out[i] = nominal * (GUESS**sides if guessed else np.maximum(1 + half * sides, 0.01))
             if nominal <= 0:
                 raise ValueError(f"{parameter.name} is {nominal}: a free damping ratio needs a positive nominal value")
     for e, element in enumerate(model.elements):

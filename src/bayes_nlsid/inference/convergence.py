@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 RHAT, LENGTH, LEAST_ESS = 1.01, 50.0, 400.0    # limits: nested R-hat, chain length over tau, effective samples
 LEAST_ACCEPTANCE, STUCK_SHARE = 0.05, 0.10
+REDRAWN_SHARE = 0.5    # of walkers replaced before sampling began, which hints at poor starts but biases nothing that is kept
 CONTRACTION, NEAR, PILED = 0.2, 0.01, 0.10
+DECADE = 10.0          # ratio of 95 % to 5 % quantile beyond which a parameter is not called determined
 Array = NDArray[np.float64]
 
 
@@ -133,7 +135,7 @@ def stuck(log_prob: Array, acceptance: Array, dimensions: int) -> NDArray[np.boo
 
 
 def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str], nonlinear: Sequence[bool], prior_sd: Array, box: Array,
-           redrawn: int = 0, stopped: str = "") -> Convergence:
+           logarithmic: Sequence[bool] | None = None, redrawn: int = 0, stopped: str = "") -> Convergence:
     """Diagnostics of draws.
 
     Parameters
@@ -149,6 +151,8 @@ def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str]
         Standard deviation of the prior, in s.
     box : ndarray (2, P)
         Bounds in s.
+    logarithmic : sequence of bool, length P
+        Entries whose s is the decimal logarithm; a force law's parameter whose 90 % interval spans more than a decade is not determined.
     redrawn : int
         Walkers replaced during burn-in.
     stopped : str
@@ -172,12 +176,17 @@ def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str]
     contraction = 1 - draws.std(axis=0) / prior_sd
     near = NEAR * (box[1] - box[0])
     piled = np.mean((draws < box[0] + near) | (draws > box[1] - near), axis=0)
-    identifiable = ~((np.asarray(nonlinear, dtype=bool) & (contraction < CONTRACTION)) | (piled > PILED))
+    low, high = np.quantile(draws, (0.05, 0.95), axis=0)
+    spread = np.where(np.zeros(p, bool) if logarithmic is None else np.asarray(logarithmic, dtype=bool), high - low, 0.0)
+    vague = np.asarray(nonlinear, dtype=bool) & ((contraction < CONTRACTION) | (spread > np.log10(DECADE)))
+    identifiable = ~(vague | (piled > PILED))
     reasons = [stopped] if stopped else []
     reasons += _convergence_reasons(names, n, tau, rhat, ess, acceptance, still, redrawn, m * w)
     converged = not reasons
     if converged:
         reasons += _identification_reasons(draws, names, nonlinear, prior_sd, contraction, piled)
+        reasons += [f"{name} is known only to within a factor of {10**wide:.2g} between its 5 % and 95 % points"
+                    for name, wide, flag in zip(names, spread, vague & (contraction >= CONTRACTION), strict=True) if flag]
     status = "not_converged" if not converged else "ok" if identifiable.all() else "not_identifiable"
     return Convergence(m, n, w, converged, float(np.max(rhat, initial=1.0)) if m > 1 else float("nan"),
                        float(np.min(ess, initial=np.inf)) if p else 0.0,
@@ -206,7 +215,7 @@ def _convergence_reasons(names: Sequence[str], n: int, tau: Array, rhat: Array, 
         reasons.append(f"fewer than {LEAST_ESS:g} effective samples of {', '.join(few)} (least {np.min(ess):.0f})")
     if (acceptance.mean(axis=1) < LEAST_ACCEPTANCE).any():
         reasons.append(f"an ensemble stands still: {100 * acceptance.mean(axis=1).min():.1f} % of its proposals were accepted")
-    elif still.sum() + redrawn > STUCK_SHARE * walkers:
+    elif still.sum() > STUCK_SHARE * walkers or redrawn > REDRAWN_SHARE * walkers:
         reasons.append(f"{int(still.sum())} walkers stand still and {redrawn} were re-drawn during burn-in, of {walkers}")
     return reasons
 

@@ -300,7 +300,8 @@ class _Run:
     def _assess(self, s: Array, value: Array, accepted: Array) -> Convergence:
         problem = self.target.problem
         return assess(s, value, accepted, names=problem.names, nonlinear=[p.param is not None for p in problem.model.parameters],
-                      prior_sd=self.target.prior_sd, box=self.target.box, redrawn=self.redrawn, stopped=self.stopped)
+                      prior_sd=self.target.prior_sd, box=self.target.box,
+                      logarithmic=self.target.coordinates.logarithmic.tolist(), redrawn=self.redrawn, stopped=self.stopped)
 
     def _tell(self) -> None:
         if self.progress is None:

@@ -18,6 +18,7 @@ from scipy.special import expit, log_ndtr, logit, ndtr, ndtri
 
 from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.problem import Problem
+from bayes_nlsid.structure.modal import ASSUMED
 
 Kind = Literal["normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal"]
 KINDS = ("normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal")
@@ -136,7 +137,9 @@ class Prior:
     def sentence(self) -> str:
         """The prior in words, with its 5 % and 95 % points in SI."""
         low, high = self.quantile([0.05, 0.95])
-        return f"{self.name}: {self.kind}, 90 % between {low:.3g} and {high:.3g} {self.unit}".rstrip()
+        # digits enough to show the width of a narrow one
+        digits = int(np.clip(np.ceil(np.log10(max(abs(low), abs(high)) / max(high - low, 1e-300))) + 2, 3, 9))
+        return f"{self.name}: {self.kind}, 90 % between {low:.{digits}g} and {high:.{digits}g} {self.unit}".rstrip()
 
 
 def _log_mass(low: float, high: float) -> float:
@@ -151,10 +154,10 @@ def default_priors(problem: Problem) -> tuple[Prior, ...]:
     """A prior for every entry of theta.
 
     Frequencies and damping ratios: normal around the modal test with its own standard deviation (``omega_sd``, ``zeta_sd``), or half the
-    bound where none is stated. The gain of the force: log-uniform. Signed coefficients: normal around 0 with a tenth of the bound, i.e. a
-    force of a tenth of the whole linear force; the bound alone, a force as large as everything linear, is far too generous. Stiffnesses,
-    forces, displacements and velocities: log-uniform over the bounds. Ranges: uniform if they include 0 or span less than two decades,
-    else log-uniform.
+    bound where none is stated, and log-uniform where the value was only assumed. The gain of the force: log-uniform. Signed
+    coefficients: normal around 0 with a tenth of the bound, i.e. a force of a tenth of the whole linear force; the bound alone, a force as
+    large as everything linear, is far too generous. Stiffnesses, forces, displacements and velocities: log-uniform over the bounds. Ranges:
+    uniform if they include 0 or span less than two decades, else log-uniform.
     """
     linear = problem.model.linear
     out = []
@@ -166,6 +169,9 @@ def default_priors(problem: Problem) -> tuple[Prior, ...]:
             damping = name.startswith("zeta")
             nominal = float((linear.zeta if damping else linear.frequency)[parameter.mode])
             relative = float((linear.zeta_sd if damping else linear.omega_sd)[parameter.mode])
+            if relative >= ASSUMED:
+                out.append(Prior(name, unit, "loguniform", low, high))
+                continue
             out.append(Prior(name, unit, "normal", low, high, nominal, relative * nominal if relative > 0 else (high - low) / 4))
         elif parameter.param.rule == "coefficient":
             out.append(Prior(name, unit, "normal", low, high, 0.0, SHARE * high))

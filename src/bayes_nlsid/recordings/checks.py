@@ -29,6 +29,7 @@ COARSE = 0.05         # quantisation step relative to the rms
 DRIFT = 0.3           # change of the local mean relative to the rms
 OFFSET = 1.0          # mean relative to the rms about it
 ALIASING = 0.05       # part of the power in the last tenth below the Nyquist frequency
+LASTING = 0.9         # rms of the last quarter over that of the first, in every channel, that no free decay has
 DEAD = 1e-6           # rms relative to the median rms of channels of the same quantity
 
 
@@ -78,6 +79,7 @@ def check(recording: Recording) -> tuple[Finding, ...]:
         found.append(Finding("error", "", f"holds only {recording.n} samples", f"record at least {SHORT}", "short"))
         return tuple(found)
     found += _alike(signals)
+    found += _driven(recording)
     for channel, x in signals:
         found += _channel(recording, channel, np.asarray(x, dtype=float), signals)
     rank = {"error": 0, "warning": 1, "note": 2}
@@ -268,6 +270,17 @@ def _coarse(recording: Recording, channel: Channel, x: Floats, step: float) -> F
         return Finding("note" if recording.role == "noise" else "warning", channel.name,
                        f"is resolved in steps of {step:.3g}, its rms is {x.std():.3g}", "raise the gain", "coarse")
     return None
+
+
+def _driven(recording: Recording) -> Iterator[Finding]:
+    """Motion without a recorded force that goes on as it began."""
+    if not recording.free or recording.role not in ("train", "linear") or recording.n < 4 * SHORT:
+        return
+    quarter = recording.n // 4
+    first, last = (x.std(axis=0) for x in (recording.response[:quarter], recording.response[-quarter:]))
+    if (last > LASTING * first).all() and first.any():
+        yield Finding("warning", "", "no force is recorded, and yet the motion does not decay",
+                      "name the channel of the force: without one the recording is taken for a free decay", "driven")
 
 
 def _alike(signals: list[tuple[Channel, Floats]]) -> Iterator[Finding]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, final
 
 import numpy as np
@@ -21,6 +22,8 @@ SETTLED_PART = 1 / 8
 BLOCKS = 64          # blocks in which quiet stretches are looked for
 LOW_QUANTILE = 0.2   # of the periodogram in a neighbourhood: the lower envelope of signal plus noise
 NEIGHBOURS = 101     # lines in a neighbourhood
+PASSED = 0.8         # of the Nyquist frequency, below which no anti-aliasing filter takes noise away
+QUIET_PART = 0.25    # of the spectrum that is taken for quiet where the force fills its band
 DEGREES = 60         # degrees of freedom wanted of a density got from scatter
 
 
@@ -90,7 +93,7 @@ def noise_psd(recording: Recording, noise_record: Recording | None = None) -> No
     ----------
     recording : Recording
     noise_record : Recording, optional
-        The same channels with the excitation off.
+        The same channels with the excitation off, or with a period after which everything but noise repeats.
 
     Returns
     -------
@@ -107,10 +110,9 @@ def noise_psd(recording: Recording, noise_record: Recording | None = None) -> No
         raise ValueError(f"recording {recording.name!r}: {recording.n} samples are too few for a spectrum, at least 16 are needed")
     if noise_record is not None:
         _same_channels(recording, noise_record)
-        return _from_stretch(noise_record, slice(0, noise_record.n), f"from the recording {noise_record.name!r} without excitation",
-                             "measured")
+        return _from_noise(noise_record, f"the recording {noise_record.name!r}")
     if recording.role == "noise":
-        return _from_stretch(recording, slice(0, recording.n), "from the recording itself, which has no excitation", "measured")
+        return _from_noise(recording, "the recording itself")
     if recording.period is not None and recording.n // recording.period >= 2:
         return _from_periods(recording)
     quiet = quiet_stretch(recording)
@@ -169,6 +171,29 @@ def _same_channels(recording: Recording, noise_record: Recording) -> None:
         raise ValueError(f"noise recording {noise_record.name!r}: {noise_record.n} samples are too few, at least 16 are needed")
 
 
+def _from_noise(recording: Recording, which: str) -> NoiseFloor:
+    """From a record without excitation, or from half the square of what differs after a period."""
+    if recording.period is None:
+        return _from_stretch(recording, slice(0, recording.n), f"from {which} without excitation", "measured")
+    t = recording.period
+    differences = replace(recording, period=None, response=(recording.response[t:] - recording.response[:-t]) / np.sqrt(2),
+                          force=(recording.force[t:] - recording.force[:-t]) / np.sqrt(2))
+    how = f"from what differs between {differences.n} samples of {which} and the same ones a period later"
+    return _from_stretch(differences, slice(0, differences.n), how, "measured")
+
+
+def as_stated(floor: NoiseFloor, rms: Sequence[float | None]) -> NoiseFloor:
+    """The floor with the channels whose noise is known from elsewhere: flat densities of the given rms (SI; None keeps what was found)."""
+    known = [i for i, value in enumerate(rms) if value is not None]
+    if not known:
+        return floor
+    psd = floor.psd.copy()
+    psd[:, known] = [float(rms[i] or 0.0) ** 2 / floor.frequency[-1] for i in known]
+    names = ", ".join(floor.channels[i].name for i in known)
+    how = "as stated in the study" if len(known) == len(rms) else f"{names} as stated in the study; the others {floor.how}"
+    return replace(floor, psd=psd, how=how, sure="measured" if len(known) == len(rms) else floor.sure)
+
+
 def _from_stretch(recording: Recording, part: slice, how: str, sure: Sureness) -> NoiseFloor:
     """Averaged periodograms (P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967) 70–73) of a stretch of noise."""
     f, psd = _averaged(recording.response[part], recording.dt)
@@ -225,6 +250,9 @@ def _from_envelope(recording: Recording) -> NoiseFloor:
     from scipy.ndimage import percentile_filter
 
     n, dt = recording.n, recording.dt
+    # A force without a period, such as a sweep, fills its whole band: there no line is free of signal, and the level of the quietest part
+    # of the spectrum is taken to hold everywhere. Between the lines of a multisine, and beside the resonances of a decay, noise shows.
+    flat = not recording.free and recording.period is None
     window = np.ones(n) if recording.period is not None else np.hanning(n + 2)[1:-1]
     f = np.fft.rfftfreq(n, dt)
     out = []
@@ -236,10 +264,15 @@ def _from_envelope(recording: Recording) -> NoiseFloor:
         low = lines.copy()
         for i in range(x.shape[1]):
             low[:, i] = percentile_filter(lines[:, i], 100 * LOW_QUANTILE, size=size, mode="nearest")
-        out.append(low / -np.log1p(-LOW_QUANTILE))
+        level = low / -np.log1p(-LOW_QUANTILE)
+        if flat:
+            quiet = (f > 0) & (f < PASSED * f[-1])
+            level = np.minimum(level, np.quantile(level[quiet], QUIET_PART, axis=0))
+        out.append(level)
     every = max(1, min(NEIGHBOURS, len(f)) // 10)
     pick = np.unique(np.append(np.arange(0, len(f), every), len(f) - 1))
-    how = (f"from the lower envelope of the spectrum ({100 * LOW_QUANTILE:.0f} % quantile of {NEIGHBOURS} lines), because no part of the "
-           "recording is quiet; it holds the skirts of the signal")
+    envelope = f"the lower envelope of the spectrum ({100 * LOW_QUANTILE:.0f} % quantile of {NEIGHBOURS} lines)"
+    how = (f"from the quietest quarter of {envelope}, taken to hold at all frequencies, because no part of the recording is quiet" if flat
+           else f"from {envelope}, because no part of the recording is quiet; it holds the skirts of the signal")
     return NoiseFloor(f[pick], out[0][pick], recording.channels, how, "bound", out[1][pick])
 

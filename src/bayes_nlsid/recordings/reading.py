@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.readers import Contents, read_file
-from bayes_nlsid.recordings.recording import SI_UNIT, Channel, Quantity, Recording, Role
+from bayes_nlsid.recordings.recording import LEAST_REPEATED, SI_UNIT, Channel, Quantity, Recording, Role
 from bayes_nlsid.recordings.units import to_si, unit_factor
 
 SAME_RATE = 1e-3  # relative difference at which a stated rate contradicts a time array
@@ -40,6 +40,8 @@ class ChannelSpec:
         For a unit of voltage: SI units of the quantity for one volt; 1.0 declares that the volt itself stands in for them.
     offset : float
         What the channel reads at rest, in the unit of the file; taken from every sample.
+    noise : float, optional
+        Root mean square of the sensor's noise where it is known, SI; 0 for a simulation.
 
     Raises
     ------
@@ -56,6 +58,7 @@ class ChannelSpec:
     polarity: int = 1
     per_volt: float | None = None
     offset: float = 0.0
+    noise: float | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -71,6 +74,8 @@ class ChannelSpec:
             raise InputError(where, f"per_volt is {self.per_volt!r}", "give a finite sensitivity other than zero")
         if not _is_number(self.offset):
             raise InputError(where, f"offset is {self.offset!r}", "give a finite number in the unit of the file")
+        if self.noise is not None and not (_is_number(self.noise) and self.noise >= 0):
+            raise InputError(where, f"noise is {self.noise!r}", "give its rms in SI, zero or more")
 
 
 @final
@@ -94,7 +99,8 @@ class RecordingSpec:
     window : tuple of float, optional
         (start, stop), s from the first sample: the part to read.
     period : int, optional
-        Samples per period, if what is read is whole steady periods.
+        Samples per period, if what is read is whole steady periods. For the role ``noise``: after how many samples the signal repeats
+        but for noise; the window may then end within a period.
     start : float, optional
         When it was taken on the test day, s; by default the first time, or 0.
 
@@ -167,9 +173,7 @@ def read_recording(spec: RecordingSpec) -> Recording:
     part = _part(spec, next(iter(lengths.values())), time, rate, where)
     dt = _dt(time, rate, part, where)
     samples = [_samples(contents, c, x, part, dt, where) for c, x in zip(spec.channels, columns, strict=True)]
-    if spec.period is not None and (part.stop - part.start) % spec.period:
-        raise InputError(where, f"{part.stop - part.start} samples are not a whole number of periods of {spec.period}",
-                         "give a window of whole periods, or no period")
+    _check_period(spec, part.stop - part.start, where)
     groups = {kind: [i for i, c in enumerate(spec.channels) if (c.quantity == "force") == kind] for kind in (False, True)}
     stacked = {kind: np.stack([samples[i] for i in index], axis=1) if index else np.zeros((part.stop - part.start, 0))
                for kind, index in groups.items()}
@@ -177,6 +181,17 @@ def read_recording(spec: RecordingSpec) -> Recording:
     first = float(time[0]) if time is not None else 0.0
     return Recording(spec.name, dt, stacked[False], labels[False], stacked[True], labels[True], spec.role, spec.period,
                      (first if spec.start is None else spec.start) + part.start * dt, spec.file, contents.sha256, _notes(spec))
+
+
+def _check_period(spec: RecordingSpec, n: int, where: str) -> None:
+    if spec.period is None:
+        return
+    if spec.role == "noise" and n < spec.period + LEAST_REPEATED:
+        raise InputError(where, f"{n} samples hold no {LEAST_REPEATED} that repeat after {spec.period}",
+                         "give a longer window, or no period if the excitation is off")
+    if spec.role != "noise" and n % spec.period:
+        raise InputError(where, f"{n} samples are not a whole number of periods of {spec.period}",
+                         "give a window of whole periods, or no period")
 
 
 def _time(contents: Contents, spec: RecordingSpec, where: str) -> NDArray[np.float64]:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Quantity = Literal["acceleration", "velocity", "displacement", "force"]
 Role = Literal["train", "holdout", "noise", "linear"]
+LEAST_REPEATED = 32
+"""Samples of a repeated stretch from which a noise level may be taken."""
 SI_UNIT = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
 
 
@@ -63,7 +65,8 @@ class Recording:
     role : {"train", "holdout", "noise", "linear"}
         ``noise``: excitation off. ``linear``: low level, for modes only.
     period : int or None
-        Samples per period, if the recording is a whole number of steady periods.
+        Samples per period, if the recording is a whole number of steady periods. With role ``noise``: what repeats after so many samples
+        differs by noise alone.
     start : float
         When it was taken on the test day, s.
     source, sha256 : str
@@ -100,7 +103,10 @@ class Recording:
         for array, what in ((self.response, "response"), (self.force, "force")):
             if not np.isfinite(array).all():
                 raise ValueError(f"recording {self.name!r}: {what} holds NaN or infinite samples")
-        if self.period is not None and (self.period < 2 or self.n % self.period):
+        if self.period is not None and self.role == "noise":
+            if self.n < self.period + LEAST_REPEATED:
+                raise ValueError(f"recording {self.name!r}: {self.n} samples hold no {LEAST_REPEATED} that repeat after {self.period}")
+        elif self.period is not None and (self.period < 2 or self.n % self.period):
             raise ValueError(f"recording {self.name!r}: {self.n} samples are not a whole number of periods of {self.period}")
 
     @property

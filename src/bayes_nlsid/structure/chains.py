@@ -42,8 +42,8 @@ def oscillator(*, mass: float = 1.0, stiffness: float | None = None, frequency: 
         raise ValueError(f"oscillator: mass {mass} and stiffness {stiffness} or frequency {frequency} must be positive")
     omega = np.sqrt(stiffness / mass) if stiffness is not None else 2 * np.pi * float(frequency or 0.0)
     ratio = zeta if zeta is not None else (damping or 0.0) / (2 * mass * omega)
-    if ratio < 0:
-        raise ValueError(f"oscillator: damping must not be negative, got ratio {ratio}")
+    if not 0 <= ratio < 1:
+        raise ValueError(f"oscillator: damping must not be negative and below critical, got ratio {ratio:g}")
     places = tuple(dict.fromkeys((location, *sensors, *inputs)))
     return ModalModel(np.array([omega]), np.array([ratio]), places, np.full((len(places), 1), mass**-0.5),
                       sensors=tuple(sensors) or (location,), inputs=tuple(inputs) or (location,), joints=(location,))

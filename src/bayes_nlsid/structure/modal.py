@@ -8,6 +8,9 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+ASSUMED = 1.0
+"""Relative standard deviation of a damping ratio that is no more than a guess."""
+
 
 @final
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class ModalModel:
     sensors, inputs, joints : tuple of str
         Which locations carry sensors, take measured forces, are suspected of nonlinearity.
     omega_sd, zeta_sd : ndarray (m,)
-        How well they are known (one standard deviation, relative); 0 where not stated.
+        How well they are known (one standard deviation, relative); 0 where not stated, `ASSUMED` or more where the value is a guess.
     residual : ndarray (L, L) or None
         Static flexibility m/N between locations of everything outside the modes kept.
     notes : tuple of str

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.structure.modal import ModalModel
+from bayes_nlsid.structure.modal import ASSUMED, ModalModel
 from bayes_nlsid.structure.reduction import Reduced, dynamic_flexibility, static_flexibility
 from bayes_nlsid.structure.structure import Modes, Structure
 from bayes_nlsid.structure.structure import modes as full_modes
@@ -34,7 +34,7 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
         The lowest so many elastic modes, or 0-based indices of elastic modes.
     zeta : float, sequence (m,) or IdentifiedModes
         Damping ratios; by default those of the damping matrix C (its diagonal in modal coordinates) if there is one, else 0.1 %. Identified
-        modes give theirs, with standard deviation, to the model modes they belong to; the others get 0.1 %.
+        modes give theirs, with standard deviation, to the model modes they belong to; the others keep 0.1 %, marked as assumed.
     measured_frequencies : bool
         Take the frequencies of identified modes too, in place of the computed ones.
     residual : bool
@@ -69,14 +69,14 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
     notes = (*structure.notes, *(_reduction_notes(source) if isinstance(source, Reduced) else ()),
              *((f"{found.rigid.shape[1]} rigid-body modes removed",) if found.rigid.shape[1] else ()))
     model = ModalModel(found.omega[index], np.full(index.size, UNKNOWN_DAMPING), names, shapes, sensors=structure.sensors,
-                       inputs=structure.inputs, joints=structure.joints, residual=G, notes=notes)
+                       inputs=structure.inputs, joints=structure.joints, zeta_sd=np.full(index.size, ASSUMED), residual=G, notes=notes)
     if structure.joints and residual:
         model = _with_note(model, _lost_at_joints(structure, model))
     if zeta is None:
-        zeta = UNKNOWN_DAMPING
-        if structure.C is not None:
-            phi = found.shapes[:, index]
-            zeta = np.einsum("ij,ij->j", phi, structure.C @ phi) / (2 * found.omega[index])
+        if structure.C is None:
+            return model
+        phi = found.shapes[:, index]
+        zeta = np.einsum("ij,ij->j", phi, structure.C @ phi) / (2 * found.omega[index])
     return with_damping(model, zeta, measured_frequencies)
 
 
@@ -91,8 +91,8 @@ def with_damping(model: ModalModel, zeta: float | Sequence[float] | NDArray[np.f
             raise ValueError(f"zeta has shape {values.shape}, expected one non-negative ratio or {(model.modes,)}")
         if measured_frequencies:
             raise ValueError("measured_frequencies needs identified modes as zeta")
-        return replace(model, zeta=values.copy())
-    omega, ratio = model.omega.copy(), np.full(model.modes, UNKNOWN_DAMPING)
+        return replace(model, zeta=values.copy(), zeta_sd=np.zeros(model.modes))
+    omega, ratio = model.omega.copy(), model.zeta.copy()
     omega_sd, zeta_sd = model.omega_sd.copy(), model.zeta_sd.copy()
     pairs = pair(zeta, model)
     for measured, k in pairs:
@@ -102,7 +102,7 @@ def with_damping(model: ModalModel, zeta: float | Sequence[float] | NDArray[np.f
     if (np.diff(omega) < 0).any():
         raise ValueError("measured frequencies would change the order of the modes; update the model first, or measure the missing modes")
     done = ", ".join(f"{k + 1}" for k in sorted(k for _, k in pairs))
-    note = f"modes {done} have measured damping{' and frequency' if measured_frequencies else ''}, others {100 * UNKNOWN_DAMPING:g} %"
+    note = f"modes {done} have measured damping{' and frequency' if measured_frequencies else ''}, others keep theirs"
     return _with_note(replace(model, omega=omega, zeta=ratio, omega_sd=omega_sd, zeta_sd=zeta_sd), note)
 
 

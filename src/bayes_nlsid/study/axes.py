@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,6 +65,25 @@ def engineering(value: float, unit: str = "", digits: int = 3) -> str:
         mantissa, power = text.split("e")
         text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
     return f"{text} {sign}".strip()
+
+
+def percent(share: float | None, digits: int = 3) -> str:
+    """A share as ``12.3 %``; a dash where there is none."""
+    return "–" if share is None or not np.isfinite(share) else f"{100 * share:.{digits}g} %"
+
+
+def floor_text(entry: Mapping[str, Any]) -> str:
+    """The noise floor of a held-out record; ``at most`` where signal may be in it."""
+    return ("at most " if entry.get("noise_sure") == "bound" else "") + percent(entry["noise_floor"], 2)
+
+
+def with_sd(value: float, sd: float, factor: float = 1.0, unit: str = "") -> str:
+    """``80.537 ± 0.004``: a value with as many decimals as its standard deviation tells."""
+    value, sd = factor * value, factor * sd
+    if not (np.isfinite(value) and np.isfinite(sd)) or sd <= 0:
+        return f"{value:.5g} {unit}".strip()
+    decimals = int(np.clip(-np.floor(np.log10(sd)), 0, 9))
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f} {unit}".strip()
 
 
 def digits_for(low: float, high: float) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from bayes_nlsid.errors import InputError
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.term import Term
 from bayes_nlsid.model import Element
-from bayes_nlsid.structure.modal import ModalModel
+from bayes_nlsid.structure.modal import ASSUMED, ModalModel
+from bayes_nlsid.structure.modal_model import UNKNOWN_DAMPING
 from bayes_nlsid.structure.structure import Structure
 from bayes_nlsid.study.schema import ElementEntry, ReductionEntry, StructureEntry, UserTermEntry
 
@@ -34,7 +36,8 @@ def build_structure(entry: StructureEntry) -> Structure | ModalModel:
     if entry.kind == "oscillator":
         from bayes_nlsid.structure.chains import oscillator
 
-        return oscillator(**values)
+        found = oscillator(**values)
+        return found if "zeta" in values or "damping" in values else _guessed(found, UNKNOWN_DAMPING)
     from bayes_nlsid.structure.matrices import read_matrices
 
     files: dict[str, Any] = dict(entry.files)
@@ -56,15 +59,22 @@ def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -
 
     modes = entry.modes or 10
     if entry.method == "none":
-        return modal_model(structure, modes, zeta=entry.damping)
+        return _guessed(modal_model(structure, modes), entry.damping)
     groups = {"sensors": structure.sensors, "inputs": structure.inputs, "joints": structure.joints}
     masters = tuple(dict.fromkeys(name for word in entry.masters for name in groups.get(word, (word,))))
     try:
         reduced = (guyan(structure, masters, guard="constrain") if entry.method == "guyan"
                    else iirs(structure, masters, iterations=entry.iterations, guard="constrain"))
-        return modal_model(reduced, modes, zeta=entry.damping)
+        return _guessed(modal_model(reduced, modes), entry.damping)
     except ValueError as error:
         raise InputError("[reduction] masters", str(error), "name more masters, or fewer modes") from None
+
+
+def _guessed(model: ModalModel, damping: float | None) -> ModalModel:
+    """The model with one damping ratio for all modes, marked as assumed; as it is where none is given."""
+    if damping is None:
+        return model
+    return replace(model, zeta=np.full(model.modes, damping), zeta_sd=np.full(model.modes, ASSUMED))
 
 
 def user_terms(entries: Sequence[UserTermEntry]) -> dict[str, Term]:

@@ -12,8 +12,9 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.errors import InputError
 from bayes_nlsid.forces.term import Term
-from bayes_nlsid.recordings.noise import NoiseFloor, noise_psd
+from bayes_nlsid.recordings.noise import NoiseFloor, as_stated, noise_psd
 from bayes_nlsid.recordings.reading import RecordingSpec, read_recording
 from bayes_nlsid.recordings.recording import Recording
 from bayes_nlsid.structure.modal import ModalModel
@@ -89,9 +90,37 @@ class Context:
         return [self.recordings[spec.name] for spec in self.study.recordings if spec.role == role]
 
     def noise(self, recording: Recording) -> NoiseFloor:
-        """Noise floor of a recording; a record of role ``noise`` with the same channels is the best evidence there is."""
-        reference = next((r for r in self.role("noise") if r.channels == recording.channels and r is not recording), None)
-        return noise_psd(recording, reference)
+        """Noise floor of a recording.
+
+        Best is a record of role ``noise`` with the same sensors; where the recording alone gives no more than a bound, what
+        another recording of the same sensors tells comes first. Channels whose noise the study states keep that.
+
+        Raises
+        ------
+        InputError
+            If a noise record cannot serve.
+        """
+        reference = next((found for r in self.role("noise") if r.name != recording.name
+                          and (found := same_sensors(r, recording)) is not None), None)
+        try:
+            floor = noise_psd(recording, reference)
+        except ValueError as error:
+            raise InputError(f"{self.study.file.name}: [[recordings]]", str(error), "change the window or the rate, or drop it") from None
+        if floor.sure == "bound":
+            floor = self._borrowed(recording) or floor
+        spec = next((s for s in self.study.recordings if s.name == recording.name), None)
+        stated = {} if spec is None else {c.name: c.noise for c in spec.channels}
+        return as_stated(floor, [stated.get(c.name) for c in recording.channels])
+
+    def _borrowed(self, recording: Recording) -> NoiseFloor | None:
+        """What the scatter between periods of another recording says of the same sensors."""
+        for other in self.recordings.values():
+            same = None if other.name == recording.name or other.role == "noise" else same_sensors(other, recording)
+            if same is not None and same.n >= 16 and abs(same.dt / recording.dt - 1) < 1e-6:
+                floor = noise_psd(same)
+                if floor.sure == "measured":
+                    return replace(floor, how=f"as in the recording {other.name!r}, {floor.how}", channels=recording.channels)
+        return None
 
     @cached_property
     def model(self) -> ModalModel:
@@ -130,6 +159,19 @@ class Context:
         if stage not in ("read", "linear"):
             out["seed"] = self.seed
         return out
+
+
+def same_sensors(candidate: Recording, recording: Recording) -> Recording | None:
+    """The candidate with its channels picked and named as in the recording; None if a sensor of the recording is missing in it."""
+    places = [(c.location, c.quantity) for c in candidate.channels]
+    picked = []
+    for channel in recording.channels:
+        found = [i for i, place in enumerate(places) if place == (channel.location, channel.quantity)]
+        found = [i for i in found if candidate.channels[i].name == channel.name] if len(found) > 1 else found
+        if not found:
+            return None
+        picked.append(found[0])
+    return replace(candidate, response=candidate.response[:, picked], channels=recording.channels)
 
 
 def _plain(value: Any) -> Any:

@@ -173,8 +173,9 @@ def recording_overview(time: Array, signals: Array, labels: Sequence[str], units
         _draw_windows(left, windows, float(time[-1]), labelled=c == 0)
         left.set_ylabel(f"{labels[c]} ({unit})")
         frequency, density = spectrum(signals[:, c], dt)
-        right.semilogy(frequency[1:], density[1:], color=BLUE, linewidth=0.9, label="recording")
-        if noise is not None:
+        if (density[1:] > 0).any():  # a silent channel has nothing that a logarithm can show
+            right.semilogy(frequency[1:], density[1:], color=BLUE, linewidth=0.9, label="recording")
+        if noise is not None and (noise[1][1:, c] > 0).any():
             right.semilogy(noise[0][1:], np.sqrt(noise[1][1:, c]), color=RED, linewidth=1.1, linestyle="--", label="noise floor")
         if band is not None:
             right.axvspan(*band, color=GREEN, alpha=0.12, linewidth=0, label="band used")

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from bayes_nlsid.study.axes import engineering
+from bayes_nlsid.study.axes import engineering, floor_text, percent
 from bayes_nlsid.study.progress import Progress
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
@@ -208,8 +208,9 @@ def _heldout(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
         if not np.isfinite(arrays["q50"]).all():
             continue
         c = int(np.argmax(arrays["measured"].std(axis=0)))
-        facts = (f"NRMSE {100 * entry['nrmse']:.3g} %, noise floor {100 * entry['noise_floor']:.2g} %, coverage of the 90 % band "
-                 f"{100 * entry['coverage90']:.0f} %")
+        facts = f"NRMSE {percent(entry['nrmse'])}, noise floor {floor_text(entry)}"
+        if entry.get("coverage90") is not None:
+            facts += f", coverage of the 90 % band {100 * entry['coverage90']:.0f} %"
         shown = {name: arrays[name][:, c] for name in ("measured", "q05", "q50", "q95")}
         image = png(heldout_overlay, arrays["time"], *shown.values(), unit=entry["units"][c], zoom=entry["zoom"], facts=facts,
                     channel=f"{entry['record']}, {entry['channels'][c]}", noise=entry["noise_rms"][c])

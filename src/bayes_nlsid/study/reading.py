@@ -13,12 +13,13 @@ from bayes_nlsid.recordings.units import unit_factor
 from bayes_nlsid.study.reading_extras import read_frf
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
-from bayes_nlsid.study.schema import LinearEntry, Study
+from bayes_nlsid.study.schema import IdentificationEntry, LinearEntry, Study
 from bayes_nlsid.study.store import file_digest
 from bayes_nlsid.study.table import Table, nearest
 
 ROLES = ("train", "holdout", "noise", "linear")
-QUANTITIES = ("acceleration", "velocity", "displacement", "force")
+QUANTITY_DIMENSION = {"acceleration": "acceleration", "velocity": "velocity", "displacement": "length", "force": "force"}
+QUANTITIES = tuple(QUANTITY_DIMENSION)
 
 
 def read_study(path: Path | str) -> Study:
@@ -51,6 +52,7 @@ def read_study(path: Path | str) -> Study:
     recordings = _read_recordings(top, locations)
     linear = _read_linear(top.table("linear"), recordings, locations)
     identification = read_identification(top.table("identification"), locations, terms)
+    _check_modes(file, identification, 1 if structure.kind == "oscillator" else reduction.modes or 10)
     posterior = read_posterior(top.table("posterior"))
     names = tuple(r.name for r in recordings)
     prediction = read_prediction(top.table("prediction"), locations, names)
@@ -67,7 +69,7 @@ def read_study(path: Path | str) -> Study:
 
 def _parse(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(str(file), "there is no such file", "give the path of a study file, or make one with nlsid new DIR") from None
     except IsADirectoryError:
@@ -96,6 +98,13 @@ def _check_order(file: Path, identification: bool, later: Mapping[str, object], 
     if identification and not any(r.role == "train" for r in recordings):
         raise InputError(f"{file.name}: [[recordings]]", 'none has role = "train", so there is nothing to identify from',
                          'give one of them role = "train"')
+
+
+def _check_modes(file: Path, entry: IdentificationEntry | None, count: int) -> None:
+    beyond = [k for k in entry.modes if k > count] if entry is not None else []
+    if beyond:
+        raise InputError(f"{file.name}: [identification] modes", f"mode {beyond[0]} does not exist, the model has {count}",
+                         "raise modes in [reduction], or name lower ones")
 
 
 def _read_recordings(top: Table, locations: Sequence[str]) -> tuple[RecordingSpec, ...]:
@@ -173,12 +182,15 @@ def _read_channel(table: Table, locations: Sequence[str]) -> ChannelSpec:
     name = table.text("name", location if quantity != "force" else f"force at {location}")
     array, column = table.text("array"), table.integer("column", None)
     offset = table.number("offset", default=0.0)
+    noise = None if not table.has("noise") else table.number("noise", QUANTITY_DIMENSION[quantity])
+    if noise is not None and noise < 0:
+        raise table.wrong("noise", f"{noise:g} is negative", "write the rms of the sensor's noise, 0 for a simulation")
     if polarity == 0 or per_volt == 0:
         key = "polarity" if polarity == 0 else "per_volt"
         raise table.wrong(key, "is 0", "write 1, or -1 for a sensor mounted the other way round" if key == "polarity"
                           else "give the sensitivity")
     table.close()
-    return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt, offset)
+    return ChannelSpec(array, quantity, unit, location, name, column, polarity, per_volt, offset, noise)
 
 
 def _read_update(table: Table) -> tuple[tuple[str, tuple[str, ...]], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,6 +38,8 @@ def read_terms(top: Table) -> tuple[UserTermEntry, ...]:
         name, formula = table.text("name"), table.text("formula")
         if name in LIBRARY or any(name == e.name for e in entries):
             raise table.wrong("name", f"{name!r} is already a term", "choose another name")
+        if not re.fullmatch(r"[\w|*^-]+", name):
+            raise table.wrong("name", f"{name!r} cannot be a name of a term", "use letters, digits and _, without blanks or brackets")
         inner = table.table("params")
         params = () if inner is None else tuple((key, _read_param(inner, key)) for key in inner.keys())
         entry = UserTermEntry(name, formula, params, table.text("memory", "none", ("none", "masing")), table.text("meaning", ""))
@@ -99,6 +102,10 @@ def read_identification(table: Table | None, locations: Sequence[str], terms: Se
     free = table.integers("free_modes", ())
     if set(free) - set(modes):
         raise table.wrong("free_modes", f"{sorted(set(free) - set(modes))} are not among modes {list(modes)}", "add them to modes")
+    name = table.text("scenario", "S2", SCENARIOS)
+    if name != "S3" and set(free) - {main}:
+        raise table.wrong("free_modes", f"{sorted(set(free) - {main})} have no equation in scenario {name}: that is of mode {main} alone",
+                          'free only that one, or write scenario = "S3"')
     joints = _known(table, "joints", table.texts("joints", ()), locations)
     tied, excess = table.flag("tied", False), table.flag("excess", True)
     elements = tuple(_read_element(t, library, locations, joints, tied, excess) for t in table.tables("elements"))
@@ -115,15 +122,23 @@ def read_identification(table: Table | None, locations: Sequence[str], terms: Se
     if 0 < table.integer("places", 192, low=0) < 8:
         raise table.wrong("places", "is too small for a table of forces", "write 0 for none, or some 100 to 400")
     entry = IdentificationEntry(
-        table.text("scenario", "S2", SCENARIOS), main, modes, free, table.span("band", "frequency", None), joints, candidates, elements,
+        name, main, modes, free, table.span("band", "frequency", None), joints, candidates, elements,
         alternatives, tied, excess, widening, table.number("eps1", default=None, positive=True),
         table.number("eps2", default=None, positive=True), table.integer("starts", 50, low=1),
         table.number("rate", "frequency", None, positive=True), _spans(table, "mode_bands", len(modes)),
-        table.flag("static_correction", False), table.number("settle", "time", 0.0), table.integer("most", 6, low=1),
+        table.flag("static_correction", False), _not_negative(table, "settle", "time"), table.integer("most", 6, low=1),
         table.number("frequency_widening", default=1.0, positive=True), table.number("damping_widening", default=1.0, positive=True),
         table.integer("places", 192, low=0), table.flag("output_error", False), table.flag("free_gain", False))
     table.close()
     return entry
+
+
+def _not_negative(table: Table, key: str, dimension: str) -> float:
+    """A number from 0 up, 0 by default."""
+    number = float(table.number(key, dimension, 0.0))
+    if number < 0:
+        raise table.wrong(key, f"{number:g} is negative", "write 0 or more")
+    return number
 
 
 def _spans(table: Table, key: str, count: int) -> tuple[tuple[float, float], ...]:

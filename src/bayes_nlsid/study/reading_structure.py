@@ -147,7 +147,7 @@ def read_reduction(table: Table | None, structure: StructureEntry) -> ReductionE
         raise table.wrong("method", "an oscillator has nothing to reduce", 'remove [reduction] or write method = "none"')
     masters = table.texts("masters", GROUPS)
     entry = ReductionEntry(method, masters, table.integer("modes", None, low=1), table.integer("iterations", 30, low=1),
-                           table.number("damping", "ratio", 1e-3, positive=True))
+                           table.number("damping", "ratio", None, positive=True))
     if method == "none" and table.has("masters"):
         raise table.wrong("masters", "is given, but method is none",
                           f"write a method ({nearest('iirs', ('guyan', 'iirs'))}), or remove masters")

@@ -8,7 +8,7 @@ from html import escape
 from typing import Any, final
 
 from bayes_nlsid.study import report_page as html
-from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, places, unit_sign
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent, places, unit_sign, with_sd
 from bayes_nlsid.study.pictures import Picture, idle
 from bayes_nlsid.study.progress import duration
 from bayes_nlsid.study.report_extras import response_section
@@ -97,10 +97,9 @@ def _linear(report: Report) -> str:
     saved = report.done.get("linear")
     if saved is None:
         return ""
-    rows = [[str(m["number"]), f"{m['measured_hz']:.4g} ± {m['measured_sd']:.1g}", "–" if m["stated_hz"] is None
-             else f"{m['stated_hz']:.4g}",
-             f"{m['model_hz']:.4g}", f"{100 * (m['model_hz'] / m['measured_hz'] - 1):+.2f} %",
-             f"{100 * m['zeta']:.3g} ± {100 * m['zeta_sd']:.1g} %",
+    rows = [[str(m["number"]), with_sd(m["measured_hz"], m["measured_sd"]), "–" if m["stated_hz"] is None else f"{m['stated_hz']:.5g}",
+             f"{m['model_hz']:.5g}", f"{100 * (m['model_hz'] / m['measured_hz'] - 1):+.2f} %",
+             with_sd(m["zeta"], m["zeta_sd"], 100, "%"),
              f"{m['mac']:.3f}", m["status"]] for m in saved.data["modes"]]
     head = ["mode", "measured (Hz)", "as stated (Hz)", "updated (Hz)", "error left", "damping", "MAC", "remark"]
     out = html.table(head, rows, "stages/linear; ± one standard deviation", numeric=(1, 2, 3, 4, 5, 6))
@@ -146,7 +145,7 @@ def _posterior(report: Report) -> str:
         u = p["unit"]
         digits = digits_for(p["q05"], p["q95"]) if p.get("q05") is not None else 4
         quantiles = [engineering(p[q], u, digits) if p.get(q) is not None else "–" for q in ("q05", "q50", "q95")]
-        known = "–" if "identifiable" not in p else "yes" if p["identifiable"] else "no: as wide as assumed"
+        known = "–" if "identifiable" not in p else "yes" if p["identifiable"] else "no: " + _why_not(p)
         rows.append([name, engineering(p["fit"], u, digits) if p["fit"] is not None else "–", *quantiles, known,
                      "–" if p.get("ess") is None else f"{p['ess']:.0f}"])
     head = ["parameter", "least squares", "5 %", "50 %", "95 %", "identifiable", "effective draws"]
@@ -165,12 +164,20 @@ def _posterior(report: Report) -> str:
     return out + html.details("What was assumed beforehand (priors)", table)
 
 
+def _why_not(parameter: Mapping[str, Any]) -> str:
+    """Why a parameter is not determined."""
+    low, high = parameter["q05"], parameter["q95"]
+    if parameter.get("narrowing", 0.0) > 0.8:
+        return "as wide as assumed"
+    return "spread over a decade or more" if low > 0 and high > 10 * low else "piled up at a bound"
+
+
 def _prediction(report: Report) -> str:
     saved = report.done.get("predict")
     if saved is None:
         return ""
-    rows = [[e["record"], f"{100 * e['nrmse']:.3g} %", f"{100 * e['nrmse_linear']:.3g} %" if e.get("nrmse_linear") is not None else "–",
-             f"{100 * e['noise_floor']:.2g} %", f"{100 * e['coverage90']:.0f} %", engineering(e["rmse"], e["unit"])
+    rows = [[e["record"], percent(e["nrmse"]), percent(e.get("nrmse_linear")), floor_text(e),
+             "–" if e.get("coverage90") is None else f"{100 * e['coverage90']:.0f} %", engineering(e["rmse"], e["unit"])
              if e.get("rmse") is not None else "–"]
             for e in saved.data.get("heldout", [])]
     out = html.table(["record not fitted", "NRMSE", "linear model", "noise floor", "inside 90 % band", "RMSE"], rows, "stages/predict",

@@ -32,13 +32,16 @@ class StructureEntry:
 @final
 @dataclass(frozen=True)
 class ReductionEntry:
-    """``[reduction]``: ``masters`` are groups (``"sensors"``, ``"inputs"``, ``"joints"``) or names of degrees of freedom."""
+    """``[reduction]``: ``masters`` are groups (``"sensors"``, ``"inputs"``, ``"joints"``) or names of degrees of freedom.
+
+    ``damping`` is the ratio of modes that are not measured; by default that of the damping matrix, or 0.1 % and free within a factor of 30.
+    """
 
     method: Literal["none", "guyan", "iirs"] = "none"
     masters: tuple[str, ...] = ("sensors", "inputs", "joints")
     modes: int | None = None
     iterations: int = 30
-    damping: float = 1e-3
+    damping: float | None = None
 
 
 @final

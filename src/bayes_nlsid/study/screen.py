@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent
 from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.stage_read import told
 from bayes_nlsid.study.story import status_words
 
 WIDTH = 100
@@ -51,8 +52,9 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
                      f"R-hat {rhat}, effective draws {ess}, stuck walkers {c['stuck_walkers']}")
     h = result.get("heldout") or {}
     if h.get("nrmse") is not None:
-        parts.append(f"held out ({', '.join(h['records'])}): NRMSE {100 * h['nrmse']:.3g} %, noise floor {100 * h['noise_floor']:.2g} %, "
-                     f"90 % band covers {100 * h['coverage90']:.0f} %")
+        parts.append(f"held out ({', '.join(h['records'])}): NRMSE {percent(h['nrmse'])}, noise floor {floor_text(h)}"
+                     + (f", 90 % band covers {100 * h['coverage90']:.0f} %" if h.get("coverage90") is not None else ""))
+    parts += _beware(result)
     files = ", ".join(name for name in ("report.html", "result.json", "posterior.nc", "backbone.npz", "figures/", "run.log")
                       if (out / name).exists())
     return "\n".join([*parts, f"\nin {out}: {files}"])
@@ -70,12 +72,32 @@ def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
     return "\n".join([*parts, f"\nin {out}: report.html, {name}.npz, result.json, figures/"])
 
 
-def plan(study: Study) -> str:
-    """What a run would do."""
+def _beware(result: Mapping[str, Any], most: int = 4) -> list[str]:
+    """What is wrong with channels, which no figure above shows: errors found in recordings, signs against the linear model."""
+    said = [told(r["name"], f) for r in result.get("recordings", []) for f in r["findings"] if f["severity"] == "error"]
+    said += [p["sentence"] for p in result.get("linear", {}).get("polarity", [])]
+    said = list(dict.fromkeys(said))
+    more = [f"  ... and {len(said) - most} more in the report"] if len(said) > most else []
+    return [_wrapped(f"  beware: {text}") for text in said[:most]] + more
+
+
+def plan(study: Study, recordings: Sequence[Mapping[str, Any]]) -> str:
+    """What a run would do.
+
+    Parameters
+    ----------
+    study : Study
+    recordings : sequence of dict
+        As `checking.examine` gives them.
+    """
     parts = [f"{study.title} ({study.file.name}): everything it names is there and readable.", ""]
     rows = [[r.name, r.role, Path(r.file).name, ", ".join(c.name for c in r.channels),
-             "whole file" if r.window is None else f"{r.window[0]:g}-{r.window[1]:g} s"] for r in study.recordings]
-    parts += [columns(["recording", "role", "file", "channels", "window"], rows), "", "stages: " + " -> ".join(study.stages)]
+             "whole file" if r.window is None else f"{r.window[0]:g}-{r.window[1]:g} s",
+             f"{found['seconds']:.4g} s", f"{found['rate']:.6g} Hz"]
+            for r, found in zip(study.recordings, recordings, strict=True)]
+    parts.append(columns(["recording", "role", "file", "channels", "window", "length", "rate"], rows, right=(5, 6)))
+    parts += [_wrapped(f"{f['severity']}: {told(r['name'], f)}") for r in recordings for f in r["findings"]]
+    parts += ["", "stages: " + " -> ".join(study.stages)]
     parts.append(_wrapped(f"structure: {study.structure.kind}, locations {', '.join(study.locations)}"))
     entry = study.identification
     if entry is not None:

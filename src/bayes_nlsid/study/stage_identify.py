@@ -124,9 +124,9 @@ def identify(context: Context) -> Result:
 def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData, ...], progress: Any) -> tuple[dict[str, Any], Arrays]:
     entry = entry_of(context)
     known = [build_element(e, context.terms) for e in variant.elements]
-    bare = base_problem(context, (), data)
     seed = context.number(f"identify {variant.name}")
     try:
+        bare = base_problem(context, (), data)
         problem = bare.with_elements(tuple(known)) if known else bare
         if variant.candidates:
             candidates = _candidates(context, variant, bare, entry)

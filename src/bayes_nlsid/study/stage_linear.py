@@ -129,7 +129,9 @@ def _with_stated_damping(context: Context, model: ModalModel) -> ModalModel:
                          "give fewer")
     zeta = model.zeta.copy()
     zeta[:len(stated)] = stated
-    return replace(model, zeta=zeta)
+    spread = model.zeta_sd.copy()
+    spread[:len(stated)] = 0.0
+    return replace(model, zeta=zeta, zeta_sd=spread)
 
 
 def _measured_into(model: ModalModel, measured: Any, frequencies: bool) -> ModalModel:

@@ -144,9 +144,11 @@ def _heldout(context: Context, entry: PredictionEntry, model: Model, draws: Arra
                    f"held{i}.q95": judged.q95}
         period = 1 / context.model.frequency[entry.mode - 1]
         units = [SI_UNIT[c.quantity] for c in recording.channels]
+        coverage = judged.coverage90 if "posterior" in context.done else None  # a fit alone has no band
         data["heldout"].append({
             "record": name, "nrmse": judged.nrmse, "nrmse_linear": linear.nrmse, "noise_floor": judged.noise_floor,
-            "coverage90": judged.coverage90, "rmse": judged.rmse, "channels": [c.name for c in recording.channels], "units": units,
+            "noise_sure": common["noise"].sure, "coverage90": coverage, "rmse": judged.rmse,
+            "channels": [c.name for c in recording.channels], "units": units,
             "unit": units[0], "noise_rms": judged.noise_rms.tolist(), "zoom": float(6 * period)})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.checks import check
+from bayes_nlsid.recordings.noise import NoiseFloor
 from bayes_nlsid.recordings.reading import RecordingSpec, read_recording
 from bayes_nlsid.recordings.recording import SI_UNIT, Recording
 from bayes_nlsid.study.axes import thinned
-from bayes_nlsid.study.context import Arrays, Context, Result
+from bayes_nlsid.study.context import Arrays, Context, Result, same_sensors
 
 MOST = 400_000
 """Samples of a recording that are kept for its picture."""
@@ -33,22 +35,55 @@ def read(context: Context) -> Result:
         context.progress(i / len(context.recordings), recording.name)
         floor = context.noise(recording)
         arrays[f"{i}.noise_frequency"], arrays[f"{i}.noise_psd"] = floor.frequency, floor.psd
-        records.append(_describe(recording, floor.rms(), floor.how))
+        records.append(describe(recording, floor))
+        refuse_dead(context, recording, records[-1]["findings"])
+        for finding in records[-1]["findings"]:
+            if finding["severity"] != "note":
+                context.note(told(recording.name, finding))
+    for quiet in context.role("noise"):
+        if all(same_sensors(quiet, r) is None for r in context.recordings.values() if r.role != "noise"):
+            context.note(f"noise recording {quiet.name} serves no other recording: it lacks one of their sensors")
     views = _views(context, arrays)
     return arrays, {"recordings": records, "views": views}
 
 
-def _describe(recording: Recording, noise: Any, how: str) -> dict[str, Any]:
+def told(recording: str, finding: Mapping[str, Any]) -> str:
+    """A finding in one sentence that names recording and channel."""
+    channel = f", channel {finding['channel']}" if finding["channel"] else ""
+    return f"{recording}{channel}: {finding['sentence']}; {finding['mend']}"
+
+
+def refuse_dead(context: Context, recording: Recording, findings: Sequence[Mapping[str, Any]]) -> None:
+    """A response that never moves holds nothing to identify from.
+
+    Raises
+    ------
+    InputError
+        If a response channel of a recording that is fitted is dead.
+    """
+    if recording.role not in ("train", "linear"):
+        return
+    responses = {c.name for c in recording.channels}
+    for finding in findings:
+        if finding["kind"] == "dead" and finding["channel"] in responses:
+            where = f"{context.study.file.name}: recording {recording.name!r}, channel {finding['channel']!r}"
+            raise InputError(where, finding["sentence"], "correct the array or column, or drop the channel")
+
+
+def describe(recording: Recording, floor: NoiseFloor) -> dict[str, Any]:
+    """What tables and the plan of a study say of one recording."""
+    noise = floor.rms()
     peaks = np.abs(recording.response).max(axis=0)
     channels = [{"name": c.name, "location": c.location, "quantity": c.quantity, "unit": SI_UNIT[c.quantity], "file_unit": c.unit,
                  "polarity": c.polarity, "rms": float(np.std(recording.response[:, k])), "peak": float(peaks[k]),
                  "noise_rms": float(noise[k])} for k, c in enumerate(recording.channels)]
     inputs = [{"name": c.name, "location": c.location, "unit": "N", "file_unit": c.unit, "rms": float(np.std(recording.force[:, k])),
                "peak": float(np.abs(recording.force[:, k]).max())} for k, c in enumerate(recording.inputs)]
-    findings = [{"severity": f.severity, "channel": f.channel, "sentence": f.sentence} for f in check(recording)]
+    findings = [{"severity": f.severity, "channel": f.channel, "sentence": f.sentence, "mend": f.mend, "kind": f.kind}
+                for f in check(recording)]
     return {"name": recording.name, "role": recording.role, "rate": recording.fs, "seconds": recording.n * recording.dt,
             "start": recording.start, "period": recording.period, "sha256": recording.sha256, "channels": channels, "inputs": inputs,
-            "noise": how, "findings": findings, "notes": list(recording.notes)}
+            "noise": floor.how, "noise_sure": floor.sure, "findings": findings, "notes": list(recording.notes)}
 
 
 def _views(context: Context, arrays: Arrays) -> list[dict[str, Any]]:

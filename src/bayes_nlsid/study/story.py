@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, places
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent, places
 from bayes_nlsid.study.schema import Study
 
 STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not converged", "not_identifiable": "refused: not identifiable",
@@ -112,8 +112,10 @@ def _heldout(result: Mapping[str, Any]) -> str:
     if not h.get("records") or h.get("nrmse") is None:
         return ""
     records = f"{len(h['records'])} record{'s' if len(h['records']) > 1 else ''}"
-    return (f"On {records} not used for fitting the simulated response errs by {100 * h['nrmse']:.3g} % (sensor noise alone "
-            f"{100 * h['noise_floor']:.2g} %), and {100 * h['coverage90']:.0f} % of the samples lie inside the 90 % band.")
+    said = f"On {records} not used for fitting the simulated response errs by {percent(h['nrmse'])} (sensor noise alone {floor_text(h)})"
+    if h.get("coverage90") is None:
+        return f"{said}."
+    return f"{said}, and {100 * h['coverage90']:.0f} % of the samples lie inside the 90 % band."
 
 
 def _inadequate(result: Mapping[str, Any]) -> str:

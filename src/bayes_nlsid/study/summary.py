@@ -12,6 +12,8 @@ import numpy as np
 from bayes_nlsid.study.schema import EXTRAS, Study
 from bayes_nlsid.study.store import Saved, versions
 
+AT_BOUND = 1e-3
+"""Share of its range within which a value counts as lying at the end of it."""
 STATUSES = ("ok", "not_converged", "not_identifiable", "failed")
 
 
@@ -25,6 +27,8 @@ def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, A
     out: dict[str, Any] = {
         "format": 1, "title": study.title, "seed": seed, "versions": versions(), "inputs": dict(study.inputs), "status": status,
         "reasons": reasons, "stages": {name: {"key": s.key, "seconds": s.seconds, "versions": s.versions} for name, s in done.items()}}
+    if "read" in done:
+        out["recordings"] = [{"name": r["name"], "findings": r["findings"]} for r in done["read"].data["recordings"]]
     if "linear" in done:
         out["linear"] = {key: done["linear"].data.get(key, []) for key in ("modes", "updated", "polarity", "notes")}
     if "identify" in done:
@@ -50,6 +54,11 @@ def _verdict(done: Mapping[str, Saved]) -> tuple[str, list[str]]:
         reasons += main["reasons"]
         if main["status"] == "failed":
             return "failed", reasons
+        astray = _astray(done)
+        if astray:
+            status = "not_identifiable"
+            reasons.append(f"{', '.join(astray)} ended at a bound of its range: the linear model is too far off; correct it, name a "
+                           "recording under [linear], or raise frequency_widening")
     if "posterior" in done:
         data = done["posterior"].data
         reasons += data["reasons"]
@@ -64,6 +73,14 @@ def _verdict(done: Mapping[str, Saved]) -> tuple[str, list[str]]:
         reasons.append(done["predict"].data["status"])
         status = "failed" if status == "ok" and done["predict"].data.get("all_failed", False) else status
     return status, list(dict.fromkeys(reasons))
+
+
+def _astray(done: Mapping[str, Saved]) -> list[str]:
+    """Natural frequencies that the fit left at an end of their range."""
+    saved = done["identify"]
+    names, theta, bounds = saved.data["variants"][0]["names"], saved.arrays["0.theta"], saved.arrays["0.bounds"]
+    return [name for name, value, (low, high) in zip(names, theta, bounds, strict=True)
+            if name.startswith("f[") and min(value - low, high - value) < AT_BOUND * (high - low)]
 
 
 def _selection(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -96,9 +113,10 @@ def _heldout(saved: Saved) -> dict[str, Any]:
     entries = saved.data.get("heldout", [])
     if not entries:
         return {"records": [], "nrmse": None, "noise_floor": None, "coverage90": None}
-    kept = ("record", "nrmse", "nrmse_linear", "noise_floor", "coverage90", "rmse", "unit")
-    return {"records": [e["record"] for e in entries],
-            **{key: float(np.mean([e[key] for e in entries])) for key in ("nrmse", "noise_floor", "coverage90")},
+    kept = ("record", "nrmse", "nrmse_linear", "noise_floor", "noise_sure", "coverage90", "rmse", "unit")
+    means = {key: [e[key] for e in entries if e.get(key) is not None] for key in ("nrmse", "noise_floor", "coverage90")}
+    return {"records": [e["record"] for e in entries], **{key: float(np.mean(x)) if x else None for key, x in means.items()},
+            "noise_sure": next((s for s in ("bound", "estimated") if any(e.get("noise_sure") == s for e in entries)), "measured"),
             "each": [{key: e[key] for key in kept if key in e} for e in entries]}
 
 
