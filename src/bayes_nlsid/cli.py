@@ -76,7 +76,10 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("out", metavar="DIR")
     add("terms", "the library of force laws as a table", _terms)
     add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses)
-    add("new", "write a commented study to start from", _new).add_argument("out", metavar="DIR")
+    new = add("new", "write a commented study to start from", _new)
+    new.add_argument("out", metavar="DIR")
+    new.add_argument("--from", dest="files", nargs="+", metavar="FILE", default=[],
+                     help="recordings, matrices, locations and modal results to write the study from; guesses are commented")
     return top
 
 
@@ -187,11 +190,16 @@ def _terms(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
-    from bayes_nlsid.study.template import write_template
+    if options.files:
+        from bayes_nlsid.study.drafting import draft_study
 
-    path = write_template(Path(options.out))
+        path, wrote = draft_study(Path(options.out), [Path(f) for f in options.files]), ""
+    else:
+        from bayes_nlsid.study.template import write_template
+
+        path, wrote = write_template(Path(options.out)), " and an example recording beside it"
     if not options.quiet:
-        print(f"wrote {path} and an example recording beside it\nnext: nlsid check {path}")
+        print(f"wrote {path}{wrote}\nnext: nlsid check {path}")
     return DONE
 
 

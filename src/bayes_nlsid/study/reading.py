@@ -15,7 +15,7 @@ from bayes_nlsid.study.reading_method import read_identification, read_posterior
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
 from bayes_nlsid.study.schema import IdentificationEntry, LinearEntry, Study
 from bayes_nlsid.study.store import file_digest
-from bayes_nlsid.study.table import Table, nearest
+from bayes_nlsid.study.table import FILL_IN, Table, gaps, nearest
 
 ROLES = ("train", "holdout", "noise", "linear")
 QUANTITY_DIMENSION = {"acceleration": "acceleration", "velocity": "velocity", "displacement": "length", "force": "force"}
@@ -40,7 +40,12 @@ def read_study(path: Path | str) -> Study:
         On the first thing that cannot be used.
     """
     file = Path(path)
-    top = Table(file, "", _parse(file))
+    content = _parse(file)
+    left = gaps(content)
+    if left:
+        raise InputError(file.name, f"{len(left)} entr{'y is' if len(left) == 1 else 'ies are'} still to be filled in: {'; '.join(left)}",
+                         f'replace the texts that begin with "{FILL_IN}"')
+    top = Table(file, "", content)
     title = top.text("title")
     seed = top.integer("seed", 0)
     outline = top.table("structure")

@@ -11,6 +11,8 @@ from bayes_nlsid.errors import InputError
 from bayes_nlsid.study.quantities import quantity
 
 _REQUIRED = object()
+FILL_IN = "FILL IN"
+"""How an entry begins that a drafted study leaves to the user."""
 _KINDS = {"bool": "true or false", "list": "a list", "dict": "a table", "str": "a text", "int": "a whole number", "float": "a number"}
 
 
@@ -21,6 +23,19 @@ def nearest(word: str, known: Sequence[str]) -> str:
         return f"did you mean {next(k for k in known if k.lower() == close[0])!r}"
     listed = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
     return f"known are {listed}" if known else "remove it"
+
+
+def gaps(value: object, place: str = "") -> list[str]:
+    """Every entry of a study that is still to be filled in: ``[[recordings.channels]] 2 unit (unit of acc in the file)``."""
+    if isinstance(value, dict):
+        return [gap for key, inner in value.items() for gap in gaps(inner, f"{place}.{key}" if place else str(key))]
+    if isinstance(value, list):
+        return [gap for i, inner in enumerate(value) for gap in gaps(inner, f"{place} {i + 1}" if isinstance(inner, dict) else place)]
+    if isinstance(value, str) and value.startswith(FILL_IN):
+        table, _, key = place.rpartition(".")
+        asked = value.removeprefix(FILL_IN).lstrip(": ")
+        return [f"[{table}] {key}" + (f" ({asked})" if asked else "")]
+    return []
 
 
 @final
