@@ -48,7 +48,7 @@ def test_help_is_quick() -> None:
     (["check", "nowhere.toml"], 2, "there is no such file"),
     (["report", "nowhere"], 2, "there is no such folder"),
     (["compare", "s.toml", "--out", "x"], 2, "not part of version"),
-    (["montecarlo", "s.toml", "--out", "x"], 2, "not part of version"),
+    (["montecarlo", "s.toml", "--out", "x"], 2, "there is no such file"),
     (["frf", "s.toml", "--out", "x"], 2, "there is no such file"),
 ])
 def test_refusals(arguments: list[str], status: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

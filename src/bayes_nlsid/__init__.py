@@ -39,6 +39,9 @@ _PUBLIC = {
     "backbone_bands": "prediction.bands", "Bands": "prediction.bands", "heldout": "prediction.heldout", "Heldout": "prediction.heldout",
     "response_curves": "prediction.continuation", "Curve": "prediction.continuation", "response_bands": "prediction.response_bands",
     "ResponseBands": "prediction.response_bands",
+    "scattered_plan": "prediction.sampling_plan", "posterior_plan": "prediction.sampling_plan", "Plan": "prediction.sampling_plan",
+    "Decay": "prediction.montecarlo", "backbones": "prediction.montecarlo", "sobol": "prediction.sensitivity",
+    "dependent_shares": "prediction.sensitivity",
     # whole studies
     "read_study": "study.reading", "run_study": "study.run", "Study": "study.schema",
 }

@@ -14,7 +14,6 @@ from bayes_nlsid.errors import InputError
 DONE, REFUSED, BAD_INPUT, STOPPED = 0, 1, 2, 130
 _ABSENT = {
     "compare": "the comparison of scenarios",
-    "montecarlo": "Monte Carlo sensitivity",
 }
 
 
@@ -65,10 +64,10 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("study", metavar="STUDY.toml")
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
     diagnose.add_argument("study", metavar="PATH", help="case folder")
-    for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),
-                       ("montecarlo", "parameter distributions to backbone bands and Sobol indices")):
+    for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),):
         add(name, f"{what} (not in this version)", _absent, out=True).add_argument("study", metavar="STUDY.toml")
-    for name, what in (("frf", "stepped-sine response curves with posterior bands"),):
+    for name, what in (("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
+                       ("frf", "stepped-sine response curves with posterior bands")):
         extra = add(name, f"{what}; the run comes first where it is missing", _extra, out=True)
         extra.add_argument("study", metavar="STUDY.toml")
         extra.add_argument("--fresh", action="store_true", help="compute this again; the run itself is kept")

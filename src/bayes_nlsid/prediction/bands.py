@@ -160,8 +160,8 @@ def backbone_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_
         If the location does not move in this mode, amplitudes are not positive, or the duration cannot be told.
     """
     theta = np.atleast_2d(draws.draws(samples, seed) if isinstance(draws, Drawable) else np.asarray(draws, dtype=float))
-    release = _release(theta, model, at, start_amplitude, mode, amplitudes, stop_amplitude, fs, duration)
-    run = _Run(model, release, scheme, alpha, band, progress)
+    release = release_of(theta, model, at, start_amplitude, mode, amplitudes, stop_amplitude, fs, duration)
+    run = Run(model, release, scheme, alpha, band, progress)
     parts = [run.curves(theta[i:i + release.chunk], release.fs) for i in range(0, len(theta), release.chunk)]
     frequency, damping = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
     status = np.concatenate([p[2] for p in parts])
@@ -169,8 +169,8 @@ def backbone_bands(draws: ArrayLike | Drawable, model: Model, *, at: str, start_
     counts = {str(name): int((status == name).sum()) for name in np.unique(status)}
     error_f, error_d = np.full(len(release.grid), np.nan), np.full(len(release.grid), np.nan)
     if ok.any():
-        middle = _median_sample(frequency, damping, ok)
-        reference = _Run(model, release, "exponential", alpha, band, progress).curves(theta[middle:middle + 1],
+        middle = median_sample(frequency, damping, ok)
+        reference = Run(model, release, "exponential", alpha, band, progress).curves(theta[middle:middle + 1],
                                                                                       REFERENCE_FACTOR * release.fs)
         error_f, error_d = frequency[middle] - reference[0][0], damping[middle] - reference[1][0]
     period_error, false_damping = parts[0][3], parts[0][4]
@@ -204,7 +204,9 @@ def amplitude_grid(amplitudes: ArrayLike | None, start: float, stop: float) -> A
 
 @final
 @dataclass(frozen=True)
-class _Release:
+class Release:
+    """A decay to be integrated: where and from what motion, at which amplitudes (m) it is read, down to which, how fast and how long."""
+
     at: str
     start: Array
     grid: Array
@@ -215,8 +217,9 @@ class _Release:
     chunk: int
 
 
-def _release(theta: Array, model: Model, at: str, amplitude: float, mode: int, amplitudes: ArrayLike | None, stop: float | None,
-             fs: float | None, duration: float | None) -> _Release:
+def release_of(theta: Array, model: Model, at: str, amplitude: float, mode: int, amplitudes: ArrayLike | None, stop: float | None,
+             fs: float | None, duration: float | None) -> Release:
+    """Checked and completed arguments of `backbone_bands`."""
     if not 0 <= mode < model.linear.modes:
         raise ValueError(f"mode {mode} does not exist; the model has modes 0 to {model.linear.modes - 1}")
     if not (np.isfinite(amplitude) and amplitude > 0):
@@ -240,16 +243,16 @@ def _release(theta: Array, model: Model, at: str, amplitude: float, mode: int, a
     chunk = max(1, int(CHUNK_BYTES // (16 * rate / every * duration)))
     start = np.zeros(model.linear.modes)
     start[mode] = amplitude / shape
-    return _Release(at, start, amplitude_grid(amplitudes, amplitude, floor), floor, float(rate), duration, every, chunk)
+    return Release(at, start, amplitude_grid(amplitudes, amplitude, floor), floor, float(rate), duration, every, chunk)
 
 
 @final
 @dataclass(frozen=True)
-class _Run:
+class Run:
     """One way of integrating the release."""
 
     model: Model
-    release: _Release
+    release: Release
     scheme: SchemeName
     alpha: float
     band: tuple[float, float] | None
@@ -274,7 +277,7 @@ class _Run:
         return frequency, damping, status, response.period_error, response.false_damping
 
 
-def _median_sample(frequency: Array, damping: Array, ok: NDArray[np.bool_]) -> int:
+def median_sample(frequency: Array, damping: Array, ok: NDArray[np.bool_]) -> int:
     """Index of the usable sample nearest to the median of both curves."""
     distance = np.zeros(len(ok))
     for curves in (frequency, damping):

@@ -30,11 +30,11 @@ class Picture:
 
 def draw_all(study: Study, done: Mapping[str, Saved], progress: Progress | None = None) -> list[Picture]:
     """Every picture that the finished stages allow, in the order of the report."""
-    from bayes_nlsid.study.pictures_extras import response_curves
+    from bayes_nlsid.study.pictures_extras import response_curves, scatter
 
     makers: list[tuple[str, Callable[[Study, Mapping[str, Saved]], list[Picture]]]] = [
         ("read", _recordings), ("linear", _linear), ("identify", _selection), ("posterior", _posterior), ("predict", _backbone),
-        ("predict", _loops), ("predict", _heldout), ("frf", response_curves)]
+        ("predict", _loops), ("predict", _heldout), ("frf", response_curves), ("montecarlo", scatter)]
     out: list[Picture] = []
     for i, (stage, maker) in enumerate(makers):
         if progress is not None:

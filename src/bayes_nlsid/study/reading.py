@@ -10,7 +10,7 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
 from bayes_nlsid.recordings.units import unit_factor
-from bayes_nlsid.study.reading_extras import read_frf
+from bayes_nlsid.study.reading_extras import read_frf, read_montecarlo
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
 from bayes_nlsid.study.schema import IdentificationEntry, LinearEntry, Study
@@ -63,13 +63,15 @@ def read_study(path: Path | str) -> Study:
     prediction = read_prediction(top.table("prediction"), locations, names)
     report = read_report(top.table("report"))
     frf = read_frf(top.table("frf"), locations)
+    montecarlo = read_montecarlo(top.table("montecarlo"), locations, prediction, posterior is not None)
     top.close()
-    _check_order(file, identification is not None, {"posterior": posterior, "prediction": prediction, "frf": frf}, recordings)
+    later = {"posterior": posterior, "prediction": prediction, "frf": frf, "montecarlo": montecarlo}
+    _check_order(file, identification is not None, later, recordings)
     others = [linear.file] if linear.file else []
     files = dict.fromkeys([*(p for _, p in structure.files), *others, *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
     return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
-                 report, frf, locations, ((file.name, file_digest(file)), *inputs))
+                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs))
 
 
 def _parse(file: Path) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""The tables of a study file for the commands beside the run: ``[frf]``."""
+"""The tables of a study file for the commands beside the run: ``[frf]`` and ``[montecarlo]``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bayes_nlsid.study.schema import FrfEntry
+from bayes_nlsid.study.schema import FrfEntry, MonteCarloEntry, PredictionEntry, SpreadEntry
 from bayes_nlsid.study.table import Table, nearest
 
 
@@ -21,6 +21,64 @@ def read_frf(table: Table | None, locations: Sequence[str]) -> FrfEntry | None:
         raise table.wrong("band", "begins at zero", 'write band = ["15 Hz", "25 Hz"]')
     entry = FrfEntry(drive, at, tuple(sorted(levels)), band, table.integer("harmonics", None, low=1, high=63),
                      table.integer("samples", 100, low=2))
+    table.close()
+    return entry
+
+
+def read_montecarlo(table: Table | None, locations: Sequence[str], prediction: PredictionEntry | None,
+                    posterior: bool) -> MonteCarloEntry | None:
+    """``[montecarlo]``; None if it is missing."""
+    if table is None:
+        return None
+    source = table.text("source", "posterior" if posterior else "fit", ("posterior", "fit"))
+    if source == "posterior" and not posterior:
+        raise table.wrong("source", "is the posterior, but there is no [posterior]", 'add [posterior], or write source = "fit"')
+    spreads = list(_scatter(table))
+    spreads += [_read_spread(inner) for inner in table.tables("parameters")]
+    if source == "posterior" and spreads:
+        key = "scatter" if table.has("scatter") else "parameters"
+        raise table.wrong(key, "states distributions beside draws of the posterior", 'write source = "fit", or remove it')
+    if source == "fit" and not spreads:
+        raise table.wrong("scatter", "is missing, and there is no [[montecarlo.parameters]] either",
+                          'write scatter = "5 %", or the distribution of each parameter')
+    at = _location(table, "at", locations) if prediction is None or table.has("at") else prediction.at
+    amplitude = table.number("amplitude", "length", *(() if prediction is None else (prediction.amplitude,)), positive=True)
+    mode = table.integer("mode", 1 if prediction is None else prediction.mode, low=1)
+    amplitudes = table.numbers("amplitudes", "length", () if prediction is None or table.has("amplitude") else prediction.amplitudes)
+    if list(amplitudes) != sorted(set(amplitudes)) or any(a <= 0 for a in amplitudes):
+        raise table.wrong("amplitudes", f"{list(amplitudes)} are not positive and ascending", 'write amplitudes = ["0.1 mm", "1 mm"]')
+    entry = MonteCarloEntry(source, at, amplitude, mode, amplitudes, tuple(spreads), table.integer("samples", 1000, low=16),
+                            table.flag("indices", True), table.text("path", "auto", ("auto", "fast", "time")))
+    table.close()
+    return entry
+
+
+def _scatter(table: Table) -> Sequence[SpreadEntry]:
+    """``scatter = "5 %"``: every parameter normal around the fit."""
+    scatter = table.number("scatter", "ratio", None, positive=True)
+    return () if scatter is None else (SpreadEntry("*", spread=scatter, relative=True),)
+
+
+def _read_spread(table: Table) -> SpreadEntry:
+    name = table.text("parameter")
+    kind = table.text("kind", "normal", ("normal", "lognormal", "uniform", "loguniform"))
+    lower, upper = table.number("lower", default=None), table.number("upper", default=None)
+    if kind in ("uniform", "loguniform"):
+        for key, value in (("lower", lower), ("upper", upper)):
+            if value is None:
+                raise table.wrong(key, "is missing", f"a {kind} distribution needs lower and upper")
+        entry = SpreadEntry(name, kind, lower=lower, upper=upper)
+    elif kind == "normal":
+        relative = table.has("scatter")
+        spread = table.number("scatter", "ratio", positive=True) if relative else table.number("sd", positive=True)
+        entry = SpreadEntry(name, kind, table.number("mean", default=None), spread, relative, lower, upper)
+    else:
+        entry = SpreadEntry(name, kind, table.number("median", default=None, positive=True), table.number("log_sd", positive=True), False,
+                            lower, upper)
+    if lower is not None and upper is not None and not lower < upper:
+        raise table.wrong("upper", f"{upper:g} is not above lower {lower:g}", "write lower < upper")
+    if kind == "loguniform" and not (lower or 0) > 0:
+        raise table.wrong("lower", f"{lower:g} is not positive", "write a lower end above zero")
     table.close()
     return entry
 

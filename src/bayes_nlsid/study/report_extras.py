@@ -38,3 +38,49 @@ def response_rows(summary: Mapping[str, Any]) -> list[list[str]]:
         error = peak["harmonic_error"]
         rows.append([*cells, "–" if error is None or error != error else f"{100 * error:.2g} %"])
     return rows
+
+
+def scatter_section(done: Mapping[str, Saved]) -> str:
+    """How the samples were drawn, the ranking, and what the numbers are worth."""
+    saved = done.get("montecarlo")
+    if saved is None:
+        return ""
+    s = saved.data["summary"]
+    told = [html.paragraph(sentence, "soft") for sentence in scatter_words(s)]
+    rows = [[p["name"], *(engineering(p[q], p["unit"], digits_for(p["q05"], p["q95"])) for q in ("q05", "q50", "q95"))]
+            for p in s["parameters"]]
+    out = html.table(["parameter", "5 %", "50 %", "95 %"], rows, "stages/montecarlo, montecarlo.npz", numeric=(1, 2, 3))
+    for name, ranked in s["sensitivity"].items():
+        head = [f"scatter of {name} at {engineering(ranked[0]['amplitude_m'], 'm')}", "first-order share", "90 % interval", "total share",
+                "90 % interval"] if ranked else []
+        out += html.table(head, [[r["name"], *share_cells(r)] for r in ranked], "stages/montecarlo, montecarlo.json", numeric=(1, 2, 3, 4))
+    return "".join(told) + out + html.listing(s["reasons"])
+
+
+def share_cells(row: Mapping[str, Any]) -> list[str]:
+    """First-order and total share with their intervals."""
+    out = []
+    for kind in ("first", "total"):
+        out += [f"{100 * row[kind]:.3g} %", f"{100 * row[f'{kind}_low']:.2g} – {100 * row[f'{kind}_high']:.2g} %"]
+    return out
+
+
+def scatter_words(s: Mapping[str, Any]) -> list[str]:
+    """Sentences about samples, paths, errors and convergence."""
+    origin = "draws of the posterior" if s["source"] == "posterior" else "samples of independent distributions"
+    paths = " and ".join(f"{count} by {'averaging' if name == 'fast' else 'time integration'}" for name, count in s["paths"].items())
+    out = [f"{s['samples']} {origin} ({paths}), mode {s['mode']} at {s['at']}; {s['evaluations']} backbones in all."]
+    n = s["numerical"]
+    if n["frequency_hz"] is not None:
+        out.append(f"The computation's own error, on the sample in the middle: {n['frequency_hz']:.1g} Hz and "
+                   f"{100 * (n['damping'] or 0):.1g} % of critical damping."
+                   + (f" Time integration at {n['fs_hz']:g} Hz: period error {100 * n['period_error']:.2g} %, false damping "
+                      f"{100 * n['false_damping']:.2g} %." if "time" in s["paths"] else ""))
+    c = s["convergence"]
+    if c["frequency"] is not None and c["frequency"] == c["frequency"]:
+        out.append(f"Doubling the samples to {c['counts'][-1]} moved the edges of the band by at most {100 * c['frequency']:.2g} % of its "
+                   f"width in frequency and {100 * (c['damping'] or 0):.2g} % in damping.")
+    if not s["independent"]:
+        out.append("Parameters of a posterior depend on each other: shares are those of a regression on the draws, and single parameters "
+                   "are swung with all others at their medians.")
+    return out

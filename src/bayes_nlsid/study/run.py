@@ -19,7 +19,7 @@ from bayes_nlsid.study.summary import summarise, to_text
 
 # a stage is a pure function of the context: what it returns is stored, and stored results are all that later stages see
 _STAGES = {stage: (f"bayes_nlsid.study.stage_{stage}", stage) for stage in (*STAGES, *EXTRAS) if stage != "report"}
-_TABLES = {"frf": ("frf", 'input, output, levels and band')}
+_NEEDED = {"frf": "input, output, levels and band", "montecarlo": 'source = "posterior", or source = "fit" and scatter = "5 %"'}
 
 
 def _stage(name: str) -> Callable[[Context], Result]:
@@ -62,8 +62,8 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
     KeyboardInterrupt
         Passed on; finished stages and sampler checkpoints stay, and the next run goes on from them.
     """
-    if extra is not None and getattr(study, _TABLES[extra][0]) is None:
-        raise InputError(f"{study.file.name}: [{extra}]", "is missing", f"add [{extra}] with {_TABLES[extra][1]}")
+    if extra is not None and getattr(study, extra) is None:
+        raise InputError(f"{study.file.name}: [{extra}]", "is missing", f"add [{extra}] with {_NEEDED[extra]}")
     store = Store(out)
     with store.lock():
         store.sweep()
@@ -126,6 +126,8 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
     for name in EXTRAS:
         if name in done:
             write_atomic(store.out / f"{name}.npz", npz(done[name].arrays))
+            write_atomic(store.out / f"{name}.json", to_text({key: result[key] for key in ("format", "title", "seed", "versions", "inputs")}
+                                                             | result[name]).encode())
     pictures = draw_all(study, done, told.update if told is not None else None)
     folder = store.out / "figures"
     folder.mkdir(exist_ok=True)

@@ -10,7 +10,7 @@ from bayes_nlsid.recordings.reading import RecordingSpec
 
 StructureKind = Literal["beam", "matrices", "oscillator"]
 STAGES = ("read", "linear", "identify", "posterior", "predict", "report")
-EXTRAS = ("frf",)
+EXTRAS = ("frf", "montecarlo")
 """Stages with commands of their own, computed from a finished run."""
 
 
@@ -218,6 +218,46 @@ class FrfEntry:
 
 @final
 @dataclass(frozen=True)
+class SpreadEntry:
+    """``[[montecarlo.parameters]]``: the distribution of a parameter, which may hold ``*`` for any part of a name.
+
+    ``centre`` is the mean (normal) or median (lognormal), None for the value of the fit; ``spread`` the standard deviation, of the natural
+    logarithm for lognormal; ``relative`` says that it is a share of the centre. Uniform kinds use ``lower`` and ``upper`` only; they cut
+    the others.
+    """
+
+    parameter: str
+    kind: Literal["normal", "lognormal", "uniform", "loguniform"] = "normal"
+    centre: float | None = None
+    spread: float = 0.0
+    relative: bool = False
+    lower: float | None = None
+    upper: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class MonteCarloEntry:
+    """``[montecarlo]``: backbones of many parameter samples, for ``nlsid montecarlo``.
+
+    ``source`` is ``"posterior"`` (draws as they are) or ``"fit"`` (independent distributions around or beside the fit: ``spreads``).
+    ``at``, ``amplitude``, ``mode`` and ``amplitudes`` are those of ``[prediction]`` where not given. ``indices``: whether Sobol indices are
+    wanted. ``path``: averaging ("fast"), time integration, or averaging with time integration where that refuses ("auto").
+    """
+
+    source: Literal["posterior", "fit"]
+    at: str
+    amplitude: float
+    mode: int = 1
+    amplitudes: tuple[float, ...] = ()
+    spreads: tuple[SpreadEntry, ...] = ()
+    samples: int = 1000
+    indices: bool = True
+    path: Literal["auto", "fast", "time"] = "auto"
+
+
+@final
+@dataclass(frozen=True)
 class PublishedEntry:
     """``[[report.published]]``: a figure from the literature to stand beside ours; spans of frequency (Hz) and damping ratio."""
 
@@ -253,8 +293,8 @@ class Study:
     linear : LinearEntry
     identification, posterior, prediction : entries or None
         A stage whose table is missing is not run.
-    frf : entry or None
-        What the command of that name computes.
+    frf, montecarlo : entries or None
+        What the commands of these names compute.
     terms : tuple of UserTermEntry
     report : ReportEntry
     locations : tuple of str
@@ -276,6 +316,7 @@ class Study:
     prediction: PredictionEntry | None = None
     report: ReportEntry = field(default_factory=ReportEntry)
     frf: FrfEntry | None = None
+    montecarlo: MonteCarloEntry | None = None
     locations: tuple[str, ...] = ()
     inputs: tuple[tuple[str, str], ...] = ()
 

@@ -62,11 +62,18 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
 
 def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
     """One screen for a command beside the run."""
-    from bayes_nlsid.study.report_extras import response_rows
+    from bayes_nlsid.study.report_extras import response_rows, scatter_words, share_cells
 
     found = result[name]
     parts = [f"{result['title']}: {'done' if found['status'] == 'ok' else found['status']}"]
     parts += [_wrapped(f"  {reason}") for reason in found["reasons"][:4]]
+    if name == "montecarlo":
+        parts += ["", *map(_wrapped, scatter_words(found))]
+        for what, ranked in found["sensitivity"].items():
+            at = engineering(ranked[0]["amplitude_m"], "m") if ranked else ""
+            rows = [[n, *share_cells(r)] for n, r in zip(brief_names([r["name"] for r in ranked]), ranked, strict=True)][:8]
+            parts.append("\n" + columns([f"scatter of {what} at {at}", "first order", "90 %", "total", "90 %"], rows, right=(1, 2, 3, 4)))
+        return "\n".join([*parts, f"\nin {out}: report.html, montecarlo.npz, montecarlo.json, figures/"])
     head = ["force", "peak (Hz)", "5-95 %", f"amplitude at {found['output']}", "5-95 %", "harmonics"]
     parts.append("\n" + columns(head, response_rows(found), right=(0, 1, 2, 3, 4, 5)))
     return "\n".join([*parts, f"\nin {out}: report.html, {name}.npz, result.json, figures/"])

@@ -109,6 +109,16 @@ levels = ["0.05 N", "0.2 N", "0.6 N"]
 band = ["17 Hz", "27 Hz"]
 samples = 50
 # harmonics = 7                   # the highest; by default as many as are needed
+
+[montecarlo]                      # for nlsid montecarlo: backbones of many samples, and which parameter their scatter comes from
+source = "fit"                    # independent distributions around the fit; or "posterior": its draws
+scatter = "5 %"                   # every parameter normal with this standard deviation
+samples = 256                     # for the band; indices take half as many again for each parameter
+
+[[montecarlo.parameters]]         # in place of the scatter above, for parameters whose name matches
+parameter = "zeta[1]"
+kind = "lognormal"                # "normal" (mean, sd or scatter), "lognormal" (median, log_sd), "uniform", "loguniform" (lower, upper)
+log_sd = 0.2
 '''
 
 
