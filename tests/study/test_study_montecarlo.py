@@ -75,7 +75,8 @@ def test_samples_of_a_posterior(small: Path, tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(pictures, "draw_all", lambda *arguments: [])
     text = small.read_text(encoding="utf-8") + "[posterior]\nsteps = 60\nmost = 400\n"
     path = tmp_path / "posterior.toml"
-    path.write_text(text.replace("recording.npz", str(small.parent / "recording.npz")) + TABLE[:TABLE.index("source")] + "samples = 300\n", encoding="utf-8")
+    text = text.replace("recording.npz", str(small.parent / "recording.npz")) + TABLE[:TABLE.index("source")]
+    path.write_text(text + "samples = 300\n", encoding="utf-8")
     main(["montecarlo", str(path), "--out", str(tmp_path / "out"), "--quiet"])
     said = json.loads((tmp_path / "out" / "montecarlo.json").read_text())
     assert said["source"] == "posterior" and not said["independent"] and said["samples"] == 300
