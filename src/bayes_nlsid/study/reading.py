@@ -63,8 +63,9 @@ def read_study(path: Path | str) -> Study:
     prediction = read_prediction(top.table("prediction"), locations, names)
     report = read_report(top.table("report"))
     frf = read_frf(top.table("frf"), locations)
-    montecarlo = read_montecarlo(top.table("montecarlo"), locations, prediction, posterior is not None)
+    scatter = top.table("montecarlo")
     top.close()
+    montecarlo = read_montecarlo(scatter, locations, prediction, posterior is not None)
     later = {"posterior": posterior, "prediction": prediction, "frf": frf, "montecarlo": montecarlo}
     _check_order(file, identification is not None, later, recordings)
     others = [linear.file] if linear.file else []
