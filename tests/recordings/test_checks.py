@@ -169,3 +169,11 @@ def test_motion_that_goes_on_without_a_force_is_told() -> None:
     force = (Channel("F", "S0", "force", "N"),)
     x = multisine(rng)[:, None]
     assert check(Recording("run", 1 / FS, x, (Channel("S0", "S0", "acceleration", ""),), x, force)) == ()
+
+
+def test_a_sweep_of_steady_amplitude_is_not_clipped() -> None:
+    """Its samples reach the very extreme again and again; cut at 90 %, it is found."""
+    t = np.arange(120_000) / 750.0
+    sweep = np.round(40 * np.sin(2 * np.pi * (5 * t + 0.28 * t**2)), 7)
+    assert "clipping" not in kinds(sweep)
+    assert "clipping" in kinds(np.clip(sweep, -36, 36))

@@ -22,6 +22,7 @@ SHORT = 256           # samples below which a recording is too short for anythin
 FLAT = 3              # equal samples in a row at the extreme that make a flat top
 FLAT_TOPS = 3         # flat tops that make clipping
 PILE_UP = 2           # samples at the extreme, relative to those in the next 10 quantisation steps (a sine has 0.4)
+NEARLY = 0.005        # distance from the extreme, relative to the range, within which turning points come close to it
 HELD = 5              # equal samples in a row, far from the extremes, that are a hold
 AROUND = 25           # samples before and after a hold that must move
 SPIKE = 12.0          # robust standard deviations of the local prediction error
@@ -169,12 +170,21 @@ def _clipping(channel: Channel, x: Floats, step: float) -> Finding | None:
         # Without rounding, equality to the last bit is no accident, unless all samples repeat, as those of a steady signal do. With
         # rounding, the extreme must outweigh the steps next to it.
         piled = at.sum() >= FLAT_TOPS and again >= 6 + PILE_UP * max(usual_count, below) and (step == 0 or again >= 20 + PILE_UP * below)
+        piled = piled and at.sum() >= 0.5 * _tops_just_below(depth, float(np.ptp(x)))
         if piled or (flat.sum() >= FLAT_TOPS and flat.sum() >= 0.2 * at.sum()):
             sides.append(f"{again} samples in {int(at.sum())} flat tops at {sign * extreme:.4g}")
     if not sides:
         return None
     return Finding("error", channel.name, f"is clipped: {' and '.join(sides)}",
                    "lower the gain and measure again, or choose a window without them", "clipping")
+
+
+def _tops_just_below(depth: Floats, span: float) -> int:
+    """Turning points that come close to the extreme and do not reach it: a sine of steady amplitude has many for each that reaches it by
+    accident, a clipped signal few."""
+    inner = depth[1:-1]
+    turning = (inner < depth[:-2]) & (inner < depth[2:])
+    return int((turning & (inner > 1e-9 * span) & (inner <= NEARLY * span)).sum())
 
 
 def _holds(recording: Recording, channel: Channel, x: Floats, step: float) -> Finding | None:
