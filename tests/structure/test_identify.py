@@ -199,3 +199,18 @@ def test_strongly_damped_modes_and_forced_noise() -> None:
                          recording.inputs, period=recording.period)
         claimed += identify_modes(deaf, model).modes
     assert claimed <= 1
+
+
+def test_damping_that_depends_on_amplitude_is_not_called_certain() -> None:
+    """Quadratic damping lets the ratio fall all along: 0.4 % plus 3 % per mm. The truth at rest lies within what is said."""
+    model = truth([40.0], [0.004])
+    a, phase, trace = 2e-3, 0.0, []
+    for _ in range(round(3 * FS)):
+        trace.append(a * np.cos(phase))
+        phase += 2 * np.pi * 40 / FS
+        a *= np.exp(-(0.004 + 30 * a) * 2 * np.pi * 40 / FS)
+    response = np.outer(trace, SHAPES[:, 0]) + 1e-6 * np.random.default_rng(1).standard_normal((len(trace), 3))
+    found = identify_modes(Recording("decay", 1 / FS, response, channels("displacement"), np.zeros((len(trace), 0))), model)
+    assert found.zeta[0] > 0.005 and abs(found.zeta[0] - 0.004) < 3 * found.zeta_sd[0]
+    assert any("depend on amplitude" in note for note in found.notes)
+    assert found.frequency_sd[0] < 1e-2

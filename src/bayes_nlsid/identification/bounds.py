@@ -13,6 +13,7 @@ from bayes_nlsid.model import Element, Model
 from bayes_nlsid.structure.modal import ASSUMED
 
 FREQUENCY, DAMPING = 0.05, 0.20   # half widths of Section 2.2
+SPREAD = 3.0                      # standard deviations of the modal test, where these are wider
 GUESS = 30.0                      # a damping ratio that was only assumed lies within this factor
 GAIN = 1.5                        # an unknown gain of the force lies within this factor of 1
 LEVERAGE_FLOOR = 0.1              # of the largest leverage among the locations of an element
@@ -22,12 +23,12 @@ MOTION_FLOOR = 0.01               # of the largest motion among them
 def bounds(model: Model, observed: Observed, widening: float, linear_widening: tuple[float, float]) -> NDArray[np.float64]:
     """Bounds (P, 2) of theta.
 
-    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``; a damping ratio that was neither
-    measured nor stated within a factor of 30; a gain of the force between 1/1.5 and 1.5. The largest force at a location
-    is the one whose modal force equals the linear modal forces (inertia + damping + stiffness, each at its largest), over the fitted
-    equations in the root-sum-square sense: F_l = ‖L‖ / ‖b_l‖. For one equation this is the paper's rule. A location that hardly
-    moves or hardly acts on the fitted equations (the middle joint in mode 1) would get an infinite bound: its leverage and motion
-    count as at least 10 % and 1 % of the largest among the locations of its element.
+    Frequencies ± 5 % and damping ratios ± 20 % of their nominal value, times ``linear_widening``, or three standard deviations of the
+    modal test if these are wider; a damping ratio that was neither measured nor stated within a factor of 30; a gain of the force between
+    1/1.5 and 1.5. The largest force at a location is the one whose modal force equals the linear modal forces (inertia + damping +
+    stiffness, each at its largest), over the fitted equations in the root-sum-square sense: F_l = ‖L‖ / ‖b_l‖. For one equation this is
+    the paper's rule. A location that hardly moves or hardly acts on the fitted equations (the middle joint in mode 1) would get an
+    infinite bound: its leverage and motion count as at least 10 % and 1 % of the largest among the locations of its element.
 
     Then: a coefficient within ± F_l over the largest value of its term; a force up to F_l; a stiffness up to F_l over the largest
     displacement; displacements and velocities up to the largest relative ones; a range as declared. All but ranges are multiplied by
@@ -58,6 +59,7 @@ def bounds(model: Model, observed: Observed, widening: float, linear_widening: t
             damping = parameter.name.startswith("zeta")
             nominal = (model.linear.zeta if damping else model.linear.frequency)[parameter.mode]
             half = DAMPING * linear_widening[1] if damping else FREQUENCY * linear_widening[0]
+            half = max(half, SPREAD * float((model.linear.zeta_sd if damping else model.linear.omega_sd)[parameter.mode]))
             guessed = damping and model.linear.zeta_sd[parameter.mode] >= ASSUMED
             out[i] = nominal * (GUESS**sides if guessed else np.maximum(1 + half * sides, 0.01))
             if nominal <= 0:

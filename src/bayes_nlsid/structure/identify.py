@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -23,6 +23,7 @@ LEAST_SIGNAL = 5.0  # residue over its standard deviation, in the best channel, 
 APART = 2.0  # lines between an uninvited resonance and any other
 UNINVITED = 2  # further resonances that a band may hold beside the modes looked for
 SURE = 0.05  # relative standard deviation of damping that a decay's window is lengthened for
+MOVED = 3.0  # combined standard deviations of two halves of a window beyond which a mode counts as depending on amplitude
 REAL = 0.2  # rad of phase scatter beyond which a shape is not called real
 
 
@@ -145,14 +146,48 @@ def _widening(recording: Recording, nominal: ModalModel, group: list[int], peaks
     span, floor, window = choice
     found: list[_Found] = []
     remarks: list[str] = []
+    stretch = (0, recording.n)
     for factor in (1.0, 3.0, 10.0) if window is None else (1.0,):
         stretches = [_stretch(recording, peaks, k, span * factor, floor, window) for k in group]
         remarks = []
-        found = _fit_decay(recording, nominal, group, peaks, _common([s for s in stretches if s is not None]), remarks)
+        stretch = _common([s for s in stretches if s is not None])
+        found = _fit_decay(recording, nominal, group, peaks, stretch, remarks)
         if len(found) == len(group) and all(f.zeta[1] <= SURE * f.zeta[0] for f in found):
             break
     notes += remarks
-    return found
+    return _drifting(recording, group, peaks, stretch, found, notes)
+
+
+def _drifting(recording: Recording, group: list[int], peaks: dict[int, Peak], stretch: tuple[int, int], found: list[_Found],
+              notes: list[str]) -> list[_Found]:
+    """Standard deviations that admit how far frequency and damping moved between the louder and the quieter half of the window.
+
+    A nonlinear structure is not linear there either: what the noise alone leaves open would be far too little to allow for it.
+    """
+    middle = sum(stretch) // 2
+    at, zeta = np.array([f.frequency[0] for f in found]), np.array([f.zeta[0] for f in found])
+    halves = []
+    for i, j in ((stretch[0], middle), (middle, stretch[1])):
+        lines = _decay_lines(recording, group, peaks, (i, j))
+        if not found or len(lines.omega) < lines.columns + len(found) * (lines.per_mode() + 1) + 2:
+            return found
+        halves.append(fit_poles(lines, [(at, zeta)]))
+    loud, quiet = halves
+    out = []
+    for i, mode in enumerate(found):
+        frequency = _admitting(mode.frequency, quiet.frequency[i] - loud.frequency[i], quiet.frequency_sd[i], loud.frequency_sd[i])
+        damping = _admitting(mode.zeta, quiet.zeta[i] - loud.zeta[i], quiet.zeta_sd[i], loud.zeta_sd[i])
+        if (frequency, damping) != (mode.frequency, mode.zeta):
+            notes.append(f"mode {mode.nominal + 1}: its frequency and damping depend on amplitude even in the quiet window, moving by "
+                         f"{quiet.frequency[i] - loud.frequency[i]:+.2g} Hz and {100 * (quiet.zeta[i] - loud.zeta[i]):+.2g} % of critical")
+        out.append(replace(mode, frequency=frequency, zeta=damping))
+    return out
+
+
+def _admitting(value: tuple[float, float], moved: float, one: float, other: float) -> tuple[float, float]:
+    """(value, sd) with the drift added to the sd, where it stands out of the noise of the halves and stays below the value itself."""
+    significant = MOVED * float(np.hypot(one, other)) < abs(moved) < value[0]
+    return (value[0], float(np.hypot(value[1], moved))) if significant else value
 
 
 def _common(stretches: list[tuple[int, int]]) -> tuple[int, int]:
@@ -164,19 +199,25 @@ def _common(stretches: list[tuple[int, int]]) -> tuple[int, int]:
 def _fit_decay(recording: Recording, nominal: ModalModel, group: list[int], peaks: dict[int, Peak], stretch: tuple[int, int],
                notes: list[str]) -> list[_Found]:
     i, j = stretch
-    piece = recording.response[i:j]
-    n, dt = len(piece), recording.dt
+    n, dt = j - i, recording.dt
     spacing = 1 / (n * dt)
-    low, high = _limits(peaks, group, max(HALF_BAND, 2.0 * len(group) + 8) * spacing, recording.fs)
-    f: Floats = np.asarray(np.fft.rfftfreq(n, dt), dtype=float)
-    inside = (f >= low) & (f <= high)
-    lines = Lines(2 * np.pi * f[inside], np.fft.rfft(piece, axis=0)[inside], np.zeros((int(inside.sum()), 0), complex), dt, True)
+    lines = _decay_lines(recording, group, peaks, stretch)
     at = np.array([peaks[k].frequency for k in group])
     fade = 1.0 / (np.pi * n * dt * at)  # damping that fades by e² over the window
     starts = [(at, np.full(len(group), 1.0) * z) for z in (fade, 3 * fade, nominal.zeta[group])]
     spread = 0.5 * spacing * (np.arange(len(group)) - (len(group) - 1) / 2)
     starts += [(at + spread, fade), (at - 0.5 * spacing, fade), (at + 0.5 * spacing, fade)]
     return _found(recording, group, peaks, lines, starts, (i * dt, j * dt), notes)
+
+
+def _decay_lines(recording: Recording, group: list[int], peaks: dict[int, Peak], stretch: tuple[int, int]) -> Lines:
+    """Spectra of a stretch in the band of a group."""
+    piece = recording.response[slice(*stretch)]
+    n, dt = len(piece), recording.dt
+    low, high = _limits(peaks, group, max(HALF_BAND, 2.0 * len(group) + 8) / (n * dt), recording.fs)
+    f: Floats = np.asarray(np.fft.rfftfreq(n, dt), dtype=float)
+    inside = (f >= low) & (f <= high)
+    return Lines(2 * np.pi * f[inside], np.fft.rfft(piece, axis=0)[inside], np.zeros((int(inside.sum()), 0), complex), dt, True)
 
 
 def _forced_groups(recording: Recording, nominal: ModalModel, peaks: dict[int, Peak]) -> list[list[int]]:
