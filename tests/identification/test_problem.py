@@ -238,7 +238,7 @@ def test_bounds_of_linear_values_follow_how_well_they_are_known():
     known = replace(beam(), omega_sd=np.array([0.03, 0, 0]), zeta_sd=np.array([0.5, 1.0, 0.01]))
     model = Model(known, (), (0, 1, 2))
     problem = Problem(model, (cubic_run(),), scenario("S3", 3, 0))
-    nominal = {f"{name}[{k + 1}]": value for name, values in (("f", known.frequency), ("zeta", known.zeta)) for k, value in enumerate(values)}
+    nominal = {f"f[{k + 1}]": f for k, f in enumerate(known.frequency)} | {f"zeta[{k + 1}]": z for k, z in enumerate(known.zeta)}
     box = {name: bound / nominal[name] for name, bound in zip(problem.names, problem.bounds, strict=True)}
     assert box["f[1]"] == pytest.approx([0.91, 1.09]) and box["f[2]"] == pytest.approx([0.95, 1.05])
     assert box["zeta[1]"] == pytest.approx([0.01, 2.5]) and box["zeta[2]"] == pytest.approx([1 / 30, 30])

@@ -146,48 +146,49 @@ def _widening(recording: Recording, nominal: ModalModel, group: list[int], peaks
     span, floor, window = choice
     found: list[_Found] = []
     remarks: list[str] = []
-    stretch = (0, recording.n)
+    stretch, poles = (0, recording.n), None
     for factor in (1.0, 3.0, 10.0) if window is None else (1.0,):
         stretches = [_stretch(recording, peaks, k, span * factor, floor, window) for k in group]
         remarks = []
         stretch = _common([s for s in stretches if s is not None])
-        found = _fit_decay(recording, nominal, group, peaks, stretch, remarks)
+        found, poles = _fit_decay(recording, nominal, group, peaks, stretch, remarks)
         if len(found) == len(group) and all(f.zeta[1] <= SURE * f.zeta[0] for f in found):
             break
     notes += remarks
-    return _drifting(recording, group, peaks, stretch, found, notes)
+    return found if poles is None else _drifting(recording, group, peaks, stretch, found, poles, notes)
 
 
 def _drifting(recording: Recording, group: list[int], peaks: dict[int, Peak], stretch: tuple[int, int], found: list[_Found],
-              notes: list[str]) -> list[_Found]:
+              poles: PoleFit, notes: list[str]) -> list[_Found]:
     """Standard deviations that admit how far frequency and damping moved between the louder and the quieter half of the window.
 
     A nonlinear structure is not linear there either: what the noise alone leaves open would be far too little to allow for it.
     """
+    if len(found) != 1 or len(poles.frequency) != 1:  # beating between neighbours would pass for a dependence on amplitude
+        return found
     middle = sum(stretch) // 2
-    at, zeta = np.array([f.frequency[0] for f in found]), np.array([f.zeta[0] for f in found])
     halves = []
-    for i, j in ((stretch[0], middle), (middle, stretch[1])):
-        lines = _decay_lines(recording, group, peaks, (i, j))
-        if not found or len(lines.omega) < lines.columns + len(found) * (lines.per_mode() + 1) + 2:
+    for part in ((stretch[0], middle), (middle, stretch[1])):
+        lines = _decay_lines(recording, group, peaks, part)
+        if len(lines.omega) < lines.columns + lines.per_mode() + 3:
             return found
-        halves.append(fit_poles(lines, [(at, zeta)]))
-    loud, quiet = halves
-    out = []
-    for i, mode in enumerate(found):
-        frequency = _admitting(mode.frequency, quiet.frequency[i] - loud.frequency[i], quiet.frequency_sd[i], loud.frequency_sd[i])
-        damping = _admitting(mode.zeta, quiet.zeta[i] - loud.zeta[i], quiet.zeta_sd[i], loud.zeta_sd[i])
-        if (frequency, damping) != (mode.frequency, mode.zeta):
-            notes.append(f"mode {mode.nominal + 1}: its frequency and damping depend on amplitude even in the quiet window, moving by "
-                         f"{quiet.frequency[i] - loud.frequency[i]:+.2g} Hz and {100 * (quiet.zeta[i] - loud.zeta[i]):+.2g} % of critical")
-        out.append(replace(mode, frequency=frequency, zeta=damping))
-    return out
+        halves.append(fit_poles(lines, [(poles.frequency, poles.zeta)]))
+    (mode,), (loud, quiet) = found, halves
+    frequency = _admitting(mode.frequency, *((float(h.frequency[0]), float(h.frequency_sd[0])) for h in halves))
+    damping = _admitting(mode.zeta, *((float(h.zeta[0]), float(h.zeta_sd[0])) for h in halves))
+    if (frequency, damping) != (mode.frequency, mode.zeta):
+        notes.append(f"mode {mode.nominal + 1}: its frequency and damping depend on amplitude even in the quiet window, moving by "
+                     f"{quiet.frequency[0] - loud.frequency[0]:+.2g} Hz and {100 * (quiet.zeta[0] - loud.zeta[0]):+.2g} % of critical")
+    return [replace(mode, frequency=frequency, zeta=damping)]
 
 
-def _admitting(value: tuple[float, float], moved: float, one: float, other: float) -> tuple[float, float]:
-    """(value, sd) with the drift added to the sd, where it stands out of the noise of the halves and stays below the value itself."""
-    significant = MOVED * float(np.hypot(one, other)) < abs(moved) < value[0]
-    return (value[0], float(np.hypot(value[1], moved))) if significant else value
+def _admitting(whole: tuple[float, float], loud: tuple[float, float], quiet: tuple[float, float]) -> tuple[float, float]:
+    """(value, sd) with the drift between the halves added to the sd, where it stands out of their noise and passes through the value of
+    the whole window; elsewhere something other than amplitude moved it."""
+    moved = quiet[0] - loud[0]
+    share = (whole[0] - loud[0]) / moved if moved else 0.0
+    drifts = MOVED * float(np.hypot(loud[1], quiet[1])) < abs(moved) < whole[0] and 0 < share < 1
+    return (whole[0], float(np.hypot(whole[1], moved))) if drifts else whole
 
 
 def _common(stretches: list[tuple[int, int]]) -> tuple[int, int]:
@@ -197,7 +198,7 @@ def _common(stretches: list[tuple[int, int]]) -> tuple[int, int]:
 
 
 def _fit_decay(recording: Recording, nominal: ModalModel, group: list[int], peaks: dict[int, Peak], stretch: tuple[int, int],
-               notes: list[str]) -> list[_Found]:
+               notes: list[str]) -> tuple[list[_Found], PoleFit | None]:
     i, j = stretch
     n, dt = j - i, recording.dt
     spacing = 1 / (n * dt)
@@ -253,7 +254,7 @@ def _fit_forced(recording: Recording, nominal: ModalModel, group: list[int], pea
         if inside.sum() >= 2 * (lines.columns + len(group) * (lines.per_mode() + 1)) + 4:
             break
     starts = [(at, nominal.zeta[group] * factor) for factor in (0.3, 1.0, 3.0)]
-    return _found(recording, group, peaks, lines, starts, (0.0, recording.n * recording.dt), notes)
+    return _found(recording, group, peaks, lines, starts, (0.0, recording.n * recording.dt), notes)[0]
 
 
 def _limits(peaks: dict[int, Peak], group: list[int], half: float, fs: float) -> tuple[float, float]:
@@ -266,13 +267,14 @@ def _limits(peaks: dict[int, Peak], group: list[int], half: float, fs: float) ->
 
 
 def _found(recording: Recording, group: list[int], peaks: dict[int, Peak], lines: Lines,
-           starts: list[tuple[NDArray[np.float64], NDArray[np.float64]]], window: tuple[float, float], notes: list[str]) -> list[_Found]:
+           starts: list[tuple[NDArray[np.float64], NDArray[np.float64]]], window: tuple[float, float],
+           notes: list[str]) -> tuple[list[_Found], PoleFit | None]:
     """Fit one band, with poles for uninvited resonances where the data ask for them, and keep the modes that stand out of the noise."""
     need = lines.columns + len(group) * (lines.per_mode() + 1) + 2
     if len(lines.omega) < need:
         notes.append(f"modes {', '.join(str(k + 1) for k in group)}: only {len(lines.omega)} lines in their band, {need} needed; "
                      "record longer")
-        return []
+        return [], None
     fit = fit_poles(lines, starts)
     for _ in range(UNINVITED):
         if len(lines.omega) < need + lines.per_mode() + 1:
@@ -289,7 +291,7 @@ def _found(recording: Recording, group: list[int], peaks: dict[int, Peak], lines
             notes.append(f"mode {k + 1} near {fit.frequency[i]:.4g} Hz: lost in noise ({fit.status})")
             continue
         found.append(_one(recording, fit, i, k, window))
-    return found
+    return found, fit
 
 
 def _whose(recording: Recording, fit: PoleFit, peaks: list[Peak], group: list[int]) -> dict[int, int]:
