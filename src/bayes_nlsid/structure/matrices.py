@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.structure.matrix_files import SEVERAL, FileMatrix, converted, matched, read_matrix, without_massless
+from bayes_nlsid.structure.matrix_files import MAX_BYTES, SEVERAL, FileMatrix, converted, matched, read_matrix, without_massless
 from bayes_nlsid.structure.structure import Matrix, Structure
 
 ROLES = ("sensors", "inputs", "joints", "other")
@@ -125,11 +125,22 @@ class _Content:
 
 
 def _archive(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of an archive, whose declared sizes are checked before anything is unpacked."""
+    import zipfile
+
     try:
+        with zipfile.ZipFile(path) as members:
+            size = sum(m.file_size for m in members.infolist())
+        if size > MAX_BYTES:
+            raise InputError(str(path), f"unpacks to {size / 2**20:.0f} MiB, more than the {MAX_BYTES / 2**20:.0f} MiB that are read at once",
+                             "reduce the model first")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise InputError(str(path), f"cannot be read as an .npz archive ({error})", "save plain arrays with numpy.savez") from error
+    except InputError:
+        raise
+    except Exception as error:  # zipfile and numpy document no closed set of exceptions for damaged files
+        detail = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(str(path), f"cannot be read as an .npz archive ({detail})", "save plain arrays with numpy.savez") from error
 
 
 def _from_archive(path: Path, archive: dict[str, NDArray[Any]]) -> _Content:
@@ -241,7 +252,9 @@ def _from_toml(path: Path) -> list[tuple[str, str, str, str, float]]:
     try:
         with open(path, "rb") as file:
             tables = tomllib.load(file).get("location", [])
-    except (OSError, tomllib.TOMLDecodeError) as error:
+        if not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
+            raise ValueError("location is no list of tables")
+    except (OSError, ValueError, RecursionError) as error:
         mend = "write [[location]] tables with name, dofs, coefficients"
         raise InputError(str(path), f"cannot be read as TOML ({error})", mend) from error
     out = []

@@ -135,7 +135,11 @@ def _boeing(data: bytes) -> Matrix:
     with tempfile.TemporaryDirectory(prefix="nlsid") as folder:
         path = Path(folder) / "matrix.hb"  # scipy reads by name or text stream; a copy keeps line ends uniform
         path.write_bytes(data.replace(b"\r\n", b"\n").replace(b"RSA", b"RUA", 1).replace(b"rsa", b"rua", 1))
-        matrix = csr_array(hb_read(path), dtype=float)
+        columns = hb_read(path)
+    columns.check_format(full_check=True)  # scipy takes indices as they are, and converting wrong ones writes over memory
+    if columns.shape[0] != columns.shape[1] or columns.shape[0] > MAX_ROWS:
+        raise Unreadable(f"holds a matrix of {columns.shape[0]} × {columns.shape[1]}", "a matrix of mass or stiffness is square")
+    matrix = csr_array(columns, dtype=float)
     return _completed(matrix) if lines[2][1:2].lower() == b"s" else matrix
 
 
