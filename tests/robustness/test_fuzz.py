@@ -238,14 +238,15 @@ def test_ten_thousand_damaged_inputs(tmp_path: Path) -> None:
     modules = {name: (kind_and_program(name)[0], program(kind_and_program(name)[1])) for name in READ_APART}
     for name, (kind, module) in modules.items():
         module.parse(kind, good(name), 2**24)
+    folders = {part: tmp_path / part for part in ("study", "files", "apart")}
+    for folder in folders.values():
+        folder.mkdir()
     while count < 10_000:
         for name in (*READ_HERE, *STUDIES, *STUDIES, *READ_APART):
             if name in STUDIES:
-                attack_study(tmp_path, damaged_study(good(name), rng))
+                attack_study(folders["study"], damaged_study(good(name), rng))
             elif name in modules:
-                attack_apart(modules[name][1], modules[name][0], damaged(good(name), rng), tmp_path)
+                attack_apart(modules[name][1], modules[name][0], damaged(good(name), rng), folders["apart"])
             else:
-                folder = tmp_path / "files"
-                folder.mkdir(exist_ok=True)
-                attack(folder, name, damaged(good(name), rng))
+                attack(folders["files"], name, damaged(good(name), rng))
             count += 1

@@ -132,7 +132,7 @@ def _archive(path: Path) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as members:
             size = sum(m.file_size for m in members.infolist())
         if size > MAX_BYTES:
-            raise InputError(str(path), f"unpacks to {size / 2**20:.0f} MiB, more than the {MAX_BYTES / 2**20:.0f} MiB that are read at once",
+            raise InputError(str(path), f"unpacks to {size / 2**20:.0f} MiB, more than is read at once ({MAX_BYTES / 2**20:.0f} MiB)",
                              "reduce the model first")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

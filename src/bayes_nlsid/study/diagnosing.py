@@ -14,8 +14,9 @@ from bayes_nlsid.mismatch.diagnose import diagnose
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, write_diagnosis
 from bayes_nlsid.study import report_page as html
 from bayes_nlsid.study.axes import digits_for, engineering
+from bayes_nlsid.study.lock import held
 from bayes_nlsid.study.progress import Reporter, duration
-from bayes_nlsid.study.store import versions, write_atomic
+from bayes_nlsid.study.store import versions, write_atomic, writing
 
 
 def run_diagnosis(path: Path | str, out: Path | str, *, seed: int = 0, reporter: Reporter | None = None) -> Diagnosis:
@@ -36,6 +37,12 @@ def run_diagnosis(path: Path | str, out: Path | str, *, seed: int = 0, reporter:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(str(folder), f"cannot be made ({error.strerror})", "choose another --out") from None
+    with writing(folder), held(folder / "figures" / "lock"):
+        return _carry_out(case, folder, seed, reporter)
+
+
+def _carry_out(case: Path, folder: Path, seed: int, reporter: Reporter | None) -> Diagnosis:
+    """Diagnose and write, with the folder held."""
     told = reporter if reporter is not None else Reporter((folder / "run.log",))
     told.begin(1, 2, "diagnose", str(case))
     found = diagnose(case, seed, lambda sentence: told.update(0.0, sentence))

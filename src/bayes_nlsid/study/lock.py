@@ -91,8 +91,12 @@ def _take(path: Path) -> None:
             else:
                 aside.unlink(missing_ok=True)
             continue
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(mine)
+        try:
+            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+                file.write(mine)
+        except OSError:  # a full disk: an empty lock would keep the next run out
+            path.unlink(missing_ok=True)
+            raise
         return
     raise InputError(str(path.parent.parent), "the lock of this folder keeps changing hands", "start one run at a time")
 

@@ -14,7 +14,7 @@ from bayes_nlsid.study.context import Context, Result
 from bayes_nlsid.study.progress import Reporter
 from bayes_nlsid.study.report import Report, render
 from bayes_nlsid.study.schema import EXTRAS, STAGES, Study
-from bayes_nlsid.study.store import Saved, Store, write_atomic
+from bayes_nlsid.study.store import Saved, Store, write_atomic, writing
 from bayes_nlsid.study.summary import summarise, to_text
 
 # a stage is a pure function of the context: what it returns is stored, and stored results are all that later stages see
@@ -65,7 +65,7 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
     if extra is not None and getattr(study, extra) is None:
         raise InputError(f"{study.file.name}: [{extra}]", "is missing", f"add [{extra}] with {_NEEDED[extra]}")
     store = Store(out)
-    with store.lock():
+    with writing(store.out), store.lock():
         store.sweep()
         keep_study(store.stages, study, study.seed if seed is None else seed)
         told = reporter if reporter is not None else Reporter((store.out / "run.log",))
@@ -169,7 +169,7 @@ def rebuild_report(out: Path | str) -> dict[str, Any]:
         raise InputError(str(out), "there is no such folder", "give the --out of an earlier nlsid run")
     study, seed = stored_study(Path(out))
     store = Store(out)
-    with store.lock():
+    with writing(store.out), store.lock():
         done = {name: saved for name in study.stages if (saved := store.load(name)) is not None}
         done |= kept_extras(store, study, done)
         return finish(store, study, done, seed)

@@ -93,7 +93,7 @@ def _plain(value: Any) -> Any:
 
 
 @contextmanager
-def _writing(where: Path) -> Iterator[None]:
+def writing(where: Path) -> Iterator[None]:
     """Turn a full disk or a forbidden folder into one sentence."""
     try:
         yield
@@ -114,7 +114,7 @@ def write_atomic(path: Path, content: bytes) -> None:
         If the disk is full or the folder is read-only.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with _writing(path.parent):
+    with writing(path.parent):
         try:
             with partial.open("wb") as file:
                 file.write(content)
@@ -155,7 +155,7 @@ class Store:
             if foreign and not self._ours_half_made():
                 raise InputError(str(self.out), f"holds {', '.join(foreign)} that this program did not make",
                                  "choose another --out, or move them away")
-        with _writing(self.out):
+        with writing(self.out):
             self.stages.mkdir(parents=True, exist_ok=True)
             if not self._mark.exists():
                 write_atomic(self._mark, json.dumps({"made_by": "bayes_nlsid", "format": FORMAT}).encode())
@@ -223,7 +223,7 @@ class Store:
         if wrong:
             raise ValueError(f"stage {stage!r}: arrays {wrong} have dtype object; store plain numbers")
         target, partial = self.stages / stage, self.stages / f".{stage}.{os.getpid()}.partial"
-        with _writing(self.out):
+        with writing(self.out):
             shutil.rmtree(partial, ignore_errors=True)
             try:
                 partial.mkdir()
@@ -262,7 +262,7 @@ class Store:
 
         Its name carries the hash of the inputs, so that a checkpoint is never continued with other inputs.
         """
-        with _writing(self.out):
+        with writing(self.out):
             for folder in self.stages.glob(f".{stage}.*.work"):
                 if folder.name != f".{stage}.{key[:16]}.work":
                     shutil.rmtree(folder, ignore_errors=True)
