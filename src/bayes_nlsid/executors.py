@@ -12,10 +12,11 @@ import multiprocessing
 import os
 import pickle
 import signal
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, final
 
 from bayes_nlsid.errors import InputError
 
@@ -38,10 +39,8 @@ def run_tasks(function: Task, shared: Any, tasks: Sequence[Any], *, executor: st
         What all tasks need; any object that pickle takes.
     tasks : sequence
         Small objects, one for each task.
-    executor : str or concurrent.futures.Executor
-        ``"local"``, ``"dask://HOST:PORT"``, or an executor; one that is handed in is left open.
-    workers : int
-        Processes for ``"local"``; 1 works in this process.
+    executor, workers
+        As for `Crew`; one that is handed in is left open.
 
     Yields
     ------
@@ -50,35 +49,76 @@ def run_tasks(function: Task, shared: Any, tasks: Sequence[Any], *, executor: st
 
     Raises
     ------
+    InputError, RuntimeError
+        As `Crew`. An exception inside a task is passed on as it is.
+    """
+    with Crew(shared, executor=executor, workers=min(workers, max(1, len(tasks)))) as crew:
+        yield from crew.run(function, tasks)
+
+
+@final
+class Crew:
+    """Workers that have been told the same; use it in a ``with`` statement for several rounds of tasks.
+
+    Parameters
+    ----------
+    shared : object
+        What all tasks need; any object that pickle takes.
+    executor : str or concurrent.futures.Executor
+        ``"local"``, ``"dask://HOST:PORT"``, or an executor.
+    workers : int
+        Processes for ``"local"``; 1 works in this process.
+
+    Raises
+    ------
     InputError
         If the cluster cannot be reached, or its package is not installed.
-    RuntimeError
-        If workers die again and again. An exception inside a task is passed on as it is.
+    ValueError
+        If ``shared`` cannot be sent to another process.
     """
-    if isinstance(executor, str) and executor not in ("local",) and not executor.startswith("dask://"):
-        raise InputError(f"--executor {executor}", "is neither local nor dask://HOST:PORT", "write one of these")
-    if not tasks:
-        return
-    if executor == "local" and (workers == 1 or len(tasks) == 1):
-        for number, task in enumerate(tasks):
-            yield number, function(shared, task)
-        return
-    content = packed(shared)
-    open_ = set(range(len(tasks)))
-    for _ in range(MOST_LOSSES):
+
+    def __init__(self, shared: Any, *, executor: str | Executor = "local", workers: int = 1) -> None:
+        if isinstance(executor, str) and executor != "local" and not executor.startswith("dask://"):
+            raise InputError(f"--executor {executor}", "is neither local nor dask://HOST:PORT", "write one of these")
+        self._shared, self._workers = shared, workers
+        self._here = executor == "local" and workers == 1
+        content = b"" if self._here else packed(shared)
+        self._place: _Place
         if isinstance(executor, Executor):
-            answers = _through(executor, function, content, tasks, sorted(open_))
+            self._place = _Foreign(executor, content)
         elif executor == "local":
-            answers = _local(function, content, tasks, sorted(open_), workers)
+            self._place = _Processes(content, workers)
         else:
-            answers = _dask(executor, function, content, tasks, sorted(open_))
-        for number, answer in answers:
-            if number in open_:
-                open_.discard(number)
-                yield number, answer
-        if not open_:
+            self._place = _Cluster(executor, content)
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._place.close()
+
+    def run(self, function: Task, tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        """One round; see `run_tasks`.
+
+        Raises
+        ------
+        RuntimeError
+            If workers die again and again.
+        """
+        if self._here:
+            for number, task in enumerate(tasks):
+                yield number, function(self._shared, task)
             return
-    raise RuntimeError(f"workers died {MOST_LOSSES} times with {len(open_)} of {len(tasks)} tasks left; do they run out of memory?")
+        left = set(range(len(tasks)))
+        for _ in range(MOST_LOSSES):
+            if not left:
+                return
+            for number, answer in self._place.round(function, tasks, sorted(left)):
+                if number in left:
+                    left.discard(number)
+                    yield number, answer
+        if left:
+            raise RuntimeError(f"workers died {MOST_LOSSES} times with {len(left)} of {len(tasks)} tasks left; do they run out of memory?")
 
 
 def packed(shared: Any) -> bytes:
@@ -130,60 +170,111 @@ def _ready() -> int:
 # --- in the process that gives the work ---------------------------------------------------------------------------------------
 
 
-def _local(function: Task, content: bytes, tasks: Sequence[Any], open_: Sequence[int], workers: int) -> Iterator[tuple[int, Any]]:
+class _Place(ABC):
+    """Where tasks are done."""
+
+    @abstractmethod
+    def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
+        """Answers to the tasks whose numbers are given; ends early if workers die, and then is asked again for what is left."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End what was begun."""
+
+
+@final
+class _Processes(_Place):
     """Spawned processes with one thread each. A process that dies breaks the pool: what it leaves is for the next one."""
-    count = min(workers, len(open_))
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_install, initargs=(content,))
-    try:
-        with _environment(SINGLE_THREAD):
-            for future in [pool.submit(_ready) for _ in range(count)]:  # processes start while the environment is set
-                future.result()
-        waiting = {pool.submit(_here, function, tasks[i]): i for i in open_}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    except BrokenExecutor:
-        return
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+
+    def __init__(self, content: bytes, workers: int) -> None:
+        self._content, self._workers = content, workers
+        self._pool: ProcessPoolExecutor | None = None
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self._workers, mp_context=multiprocessing.get_context("spawn"), initializer=_install,
+                                             initargs=(self._content,))
+            with _environment(SINGLE_THREAD):  # processes start while the environment is set
+                for future in [self._pool.submit(_ready) for _ in range(self._workers)]:
+                    future.result()
+        return self._pool
+
+    def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
+        waiting: dict[Future[Any], int] = {}
+        try:
+            pool = self._started()
+            waiting.update((pool.submit(_here, function, tasks[i]), i) for i in left)
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        except BrokenExecutor:
+            self.close()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
 
 
-def _through(pool: Executor, function: Task, content: bytes, tasks: Sequence[Any], open_: Sequence[int]) -> Iterator[tuple[int, Any]]:
+@final
+class _Foreign(_Place):
     """Any executor: its interface knows no way to send data ahead, so the bytes go along and are unpacked once in each worker."""
-    waiting = {pool.submit(_with, function, content, tasks[i]): i for i in open_}
-    try:
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    except BrokenExecutor as error:
-        raise RuntimeError(f"the executor broke ({error}); give a fresh one and start again: what was stored is kept") from error
-    finally:
-        for future in waiting:
-            future.cancel()
+
+    def __init__(self, pool: Executor, content: bytes) -> None:
+        self._pool, self._content = pool, content
+
+    def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
+        waiting = {self._pool.submit(_with, function, self._content, tasks[i]): i for i in left}
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        except BrokenExecutor as error:
+            raise RuntimeError(f"the executor broke ({error}); give a fresh one and start again: what was stored is kept") from error
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def close(self) -> None:
+        """It belongs to the caller."""
 
 
-def _dask(address: str, function: Task, content: bytes, tasks: Sequence[Any], open_: Sequence[int]) -> Iterator[tuple[int, Any]]:
-    """A Dask cluster: the scheduler does again what dies with a worker; what it gives up on is left to the caller."""
-    try:
-        import distributed
-    except ImportError:
-        raise InputError(f"--executor {address}", "needs the package distributed, which is not installed",
-                         "install bayes-nlsid[dask] here and on the workers") from None
-    try:
-        client = distributed.Client("tcp://" + address.removeprefix("dask://"), timeout=10, set_as_default=False)
-    except (OSError, TimeoutError, ValueError):
-        raise InputError(f"--executor {address}", "no scheduler answers there", "start one with: dask scheduler") from None
-    with client:
-        if not client.scheduler_info()["workers"]:
+@final
+class _Cluster(_Place):
+    """A Dask cluster: the scheduler does again what dies with a worker; what it gives up on comes in another round."""
+
+    def __init__(self, address: str, content: bytes) -> None:
+        try:
+            import distributed
+        except ImportError:
+            raise InputError(f"--executor {address}", "needs the package distributed, which is not installed",
+                             'install "bayes-nlsid[dask]" here and on the workers') from None
+        self._dask, self._content = distributed, content
+        try:
+            self._client = distributed.Client("tcp://" + address.removeprefix("dask://"), timeout=10, set_as_default=False)
+        except (OSError, TimeoutError, ValueError):
+            raise InputError(f"--executor {address}", "no scheduler answers there", "start one with: dask scheduler") from None
+        if not self._client.scheduler_info()["workers"]:
+            self._client.close()
             raise InputError(f"--executor {address}", "the scheduler has no workers", f"start some with: dask worker {address[7:]}")
-        sent = client.scatter(content, broadcast=True, hash=False)
-        waiting = {client.submit(_with, function, sent, tasks[i], pure=False, retries=0): i for i in open_}
-        lost = (distributed.scheduler.KilledWorker, distributed.client.FutureCancelledError, distributed.client.FuturesCancelledError)
-        for future in distributed.as_completed(waiting):
-            try:
-                answer = future.result()
-            except lost:
-                continue
-            yield waiting[future], answer
-            future.release()
+
+    def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
+        lost = (self._dask.scheduler.KilledWorker, self._dask.client.FutureCancelledError, self._dask.client.FuturesCancelledError)
+        sent = self._client.scatter(self._content, broadcast=True, hash=False)
+        waiting = {self._client.submit(_with, function, sent, tasks[i], pure=False): i for i in left}
+        try:
+            for future in self._dask.as_completed(list(waiting), loop=self._client.loop):
+                try:
+                    answer = future.result()
+                except lost:
+                    continue
+                yield waiting[future], answer
+        finally:
+            self._client.cancel(list(waiting))
+
+    def close(self) -> None:
+        self._client.close()
 
 
 @contextmanager
