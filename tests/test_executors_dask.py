@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayes_nlsid import executors
 from bayes_nlsid.cli import main
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.executors import run_tasks
@@ -47,6 +50,16 @@ def ticket(shared: dict[str, str], task: int) -> int:
     return task + 1
 
 
+def slow_ticket(shared: dict[str, str], task: int) -> int:
+    time.sleep(0.2)
+    return ticket(shared, task)
+
+
+def deadly(shared: None, task: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return task
+
+
 def test_each_task_is_answered_once(cluster: Any, tmp_path: Path) -> None:
     found = list(run_tasks(ticket, {"folder": str(tmp_path)}, list(range(30)), executor=address(cluster)))
     assert sorted(found) == [(k, k + 1) for k in range(30)]
@@ -56,7 +69,7 @@ def test_each_task_is_answered_once(cluster: Any, tmp_path: Path) -> None:
 
 def test_a_killed_worker_loses_nothing_and_doubles_nothing(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(montecarlo, "TIME_CHUNK", 2)
-    theta, model = scattered(IWAN, 48), beam("iwan4_memory")
+    theta, model = scattered(IWAN, 32), beam("iwan4_memory")
     decay = Decay("tip", 2.4e-3, amplitudes=(1.3e-3, 2e-3), fs=600.0, scheme="exponential", duration=1.7)
     alone = backbones(model, theta, decay, path="time")
     two = backbones(model, theta, decay, path="time", workers=2)
@@ -69,7 +82,7 @@ def test_a_killed_worker_loses_nothing_and_doubles_nothing(cluster: Any, tmp_pat
 
     third = backbones(model, theta, decay, path="time", executor=address(cluster), folder=tmp_path, progress=strike)
     assert killed and killed[0] not in pids(cluster)
-    assert len(list(tmp_path.glob("chunk_*.npz"))) == 24
+    assert len(list(tmp_path.glob("chunk_*.npz"))) == 16
     for other in (two, third):
         for name in ("frequency", "damping", "status", "path"):
             assert np.array_equal(getattr(alone, name), getattr(other, name), equal_nan=name in ("frequency", "damping")), name
@@ -106,8 +119,45 @@ def test_a_scheduler_that_is_not_there_or_has_no_workers_is_said(tmp_path: Path)
         list(run_tasks(ticket, {}, [1], executor=address(empty)))
 
 
+def test_a_worker_of_another_version_is_refused(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "__version__", "9.9.9")
+    with pytest.raises(InputError, match="has version .* install bayes-nlsid==9.9.9"):
+        list(run_tasks(ticket, {}, [1], executor=address(cluster)))
+
+
+def test_a_task_that_kills_every_worker_is_given_up(tmp_path: Path) -> None:
+    with (distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as found,
+          pytest.raises(InputError, match="workers died 5 times with 1 of 1 tasks left")):
+        list(run_tasks(deadly, None, [0], executor=address(found)))
+
+
+def test_a_scheduler_that_dies_in_mid_run_is_said(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+               "--scheduler-file", str(tmp_path / "where.json")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    helper = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment)
+    try:
+        while not (tmp_path / "where.json").exists():
+            time.sleep(0.05)
+        where = json.loads((tmp_path / "where.json").read_text())["address"]
+        worker = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", where, "--no-dashboard", "--death-timeout", "5"],
+                                  stderr=subprocess.DEVNULL, env=environment)
+        with distributed.Client(where, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=60)
+        with pytest.raises(InputError, match="scheduler is gone"):
+            for number, _ in run_tasks(slow_ticket, {"folder": str(tmp_path)}, list(range(40)), executor=where.replace("tcp", "dask")):
+                if number == 0:
+                    helper.kill()
+    finally:
+        helper.kill()
+        worker.kill()
+        helper.wait()
+        worker.wait()
+
+
 def test_without_the_package_it_says_what_to_install() -> None:
-    code = ("import sys; sys.modules['distributed'] = None\nfrom bayes_nlsid.executors import Crew\nfrom bayes_nlsid.errors import InputError\n"
+    code = ("import sys; sys.modules['distributed'] = None\nfrom bayes_nlsid.executors import Crew\n"
+            "from bayes_nlsid.errors import InputError\n"
             "try:\n    Crew({}, executor='dask://a:1')\nexcept InputError as error:\n    print(error)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                           env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1] / "src")})

@@ -12,12 +12,15 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from typing import Any, final
 
+from bayes_nlsid import __version__
 from bayes_nlsid.errors import InputError
 
 Task = Callable[[Any, Any], Any]
@@ -49,7 +52,7 @@ def run_tasks(function: Task, shared: Any, tasks: Sequence[Any], *, executor: st
 
     Raises
     ------
-    InputError, RuntimeError
+    InputError, ValueError
         As `Crew`. An exception inside a task is passed on as it is.
     """
     with Crew(shared, executor=executor, workers=min(workers, max(1, len(tasks)))) as crew:
@@ -72,7 +75,7 @@ class Crew:
     Raises
     ------
     InputError
-        If the cluster cannot be reached, or its package is not installed.
+        If the cluster cannot be reached, has no workers or another version of this package, or Dask is not installed here.
     ValueError
         If ``shared`` cannot be sent to another process.
     """
@@ -80,10 +83,12 @@ class Crew:
     def __init__(self, shared: Any, *, executor: str | Executor = "local", workers: int = 1) -> None:
         if isinstance(executor, str) and executor != "local" and not executor.startswith("dask://"):
             raise InputError(f"--executor {executor}", "is neither local nor dask://HOST:PORT", "write one of these")
-        self._shared, self._workers = shared, workers
+        self._shared, self._name = shared, f"--executor {executor}" if executor != "local" else f"--workers {workers}"
         self._here = executor == "local" and workers == 1
         content = b"" if self._here else packed(shared)
-        self._place: _Place
+        self._place: _Place = _Nowhere()
+        if self._here:
+            return
         if isinstance(executor, Executor):
             self._place = _Foreign(executor, content)
         elif executor == "local":
@@ -95,15 +100,17 @@ class Crew:
         return self
 
     def __exit__(self, *reason: object) -> None:
-        self._place.close()
+        self._place.close(hurry=reason[0] is not None)
 
     def run(self, function: Task, tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """One round; see `run_tasks`.
 
         Raises
         ------
+        InputError
+            If workers die again and again, or the scheduler does.
         RuntimeError
-            If workers die again and again.
+            If an executor that was handed in breaks.
         """
         if self._here:
             for number, task in enumerate(tasks):
@@ -118,7 +125,8 @@ class Crew:
                     left.discard(number)
                     yield number, answer
         if left:
-            raise RuntimeError(f"workers died {MOST_LOSSES} times with {len(left)} of {len(tasks)} tasks left; do they run out of memory?")
+            raise InputError(self._name, f"workers died {MOST_LOSSES} times with {len(left)} of {len(tasks)} tasks left",
+                             "see that they have memory enough, or take fewer on one machine")
 
 
 def packed(shared: Any) -> bytes:
@@ -150,8 +158,9 @@ def _unpacked(content: bytes) -> Any:
 
 
 def _install(content: bytes) -> None:
-    """Once in each local worker: take what all tasks need; leave Ctrl-C to the process that gave the work."""
+    """Once in each local worker: take what all tasks need; leave Ctrl-C to the process that gave the work, and die with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     _ARRIVED["local"] = pickle.loads(content)
 
 
@@ -163,8 +172,20 @@ def _with(function: Task, content: bytes, task: Any) -> Any:
     return function(_unpacked(content), task)
 
 
+def _die_with_parent() -> None:
+    """A pool never tells its processes that the one which made them was killed; they would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
 def _ready() -> int:
     return os.getpid()
+
+
+def _version() -> str:
+    return __version__
 
 
 # --- in the process that gives the work ---------------------------------------------------------------------------------------
@@ -178,8 +199,19 @@ class _Place(ABC):
         """Answers to the tasks whose numbers are given; ends early if workers die, and then is asked again for what is left."""
 
     @abstractmethod
-    def close(self) -> None:
-        """End what was begun."""
+    def close(self, hurry: bool = False) -> None:
+        """End what was begun; in a hurry without waiting for tasks that are being done."""
+
+
+@final
+class _Nowhere(_Place):
+    """For work that is done in this process."""
+
+    def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
+        yield from ()
+
+    def close(self, hurry: bool = False) -> None:
+        """There is nothing to end."""
 
 
 @final
@@ -204,16 +236,18 @@ class _Processes(_Place):
         try:
             pool = self._started()
             waiting.update((pool.submit(_here, function, tasks[i]), i) for i in left)
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
+            for future in as_completed(list(waiting)):
+                yield waiting.pop(future), future.result()  # what has been handed on is not kept here
         except BrokenExecutor:
             self.close()
         finally:
             for future in waiting:
                 future.cancel()
 
-    def close(self) -> None:
+    def close(self, hurry: bool = False) -> None:
         if self._pool is not None:
+            for process in list((getattr(self._pool, "_processes", None) or {}).values()) if hurry else ():
+                process.terminate()
             self._pool.shutdown(wait=True, cancel_futures=True)
             self._pool = None
 
@@ -228,15 +262,15 @@ class _Foreign(_Place):
     def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
         waiting = {self._pool.submit(_with, function, self._content, tasks[i]): i for i in left}
         try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
+            for future in as_completed(list(waiting)):
+                yield waiting.pop(future), future.result()
         except BrokenExecutor as error:
             raise RuntimeError(f"the executor broke ({error}); give a fresh one and start again: what was stored is kept") from error
         finally:
             for future in waiting:
                 future.cancel()
 
-    def close(self) -> None:
+    def close(self, hurry: bool = False) -> None:
         """It belongs to the caller."""
 
 
@@ -250,30 +284,57 @@ class _Cluster(_Place):
         except ImportError:
             raise InputError(f"--executor {address}", "needs the package distributed, which is not installed",
                              'install "bayes-nlsid[dask]" here and on the workers') from None
-        self._dask, self._content = distributed, content
+        self._dask, self._content, self._address, self._sent = distributed, content, address, None
         try:
             self._client = distributed.Client("tcp://" + address.removeprefix("dask://"), timeout=10, set_as_default=False)
         except (OSError, TimeoutError, ValueError):
             raise InputError(f"--executor {address}", "no scheduler answers there", "start one with: dask scheduler") from None
-        if not self._client.scheduler_info()["workers"]:
+        try:
+            self._muster()
+        except InputError:
             self._client.close()
-            raise InputError(f"--executor {address}", "the scheduler has no workers", f"start some with: dask worker {address[7:]}")
+            raise
+
+    def _muster(self) -> None:
+        """See that there are workers, and that they would compute the same; the scheduler, too, reads what is sent."""
+        found = self._client.run(_version, on_error="return")
+        if not found:
+            raise InputError(f"--executor {self._address}", "the scheduler has no workers",
+                             f"start some with: dask worker {self._address.removeprefix('dask://')}")
+        try:
+            found = {"scheduler": self._client.run_on_scheduler(_version), **{f"worker {name}": v for name, v in found.items()}}
+        except Exception as error:  # whatever it cannot import
+            found = {"scheduler": error}
+        for place, version in found.items():
+            if version != __version__:
+                has = f"version {version}" if isinstance(version, str) else f"no usable bayes_nlsid ({version})"
+                raise InputError(f"--executor {self._address}", f"the {place} has {has}",
+                                 f"install bayes-nlsid=={__version__} there")
 
     def round(self, function: Task, tasks: Sequence[Any], left: Sequence[int]) -> Iterator[tuple[int, Any]]:
-        lost = (self._dask.scheduler.KilledWorker, self._dask.client.FutureCancelledError, self._dask.client.FuturesCancelledError)
-        sent = self._client.scatter(self._content, broadcast=True, hash=False)
-        waiting = {self._client.submit(_with, function, sent, tasks[i], pure=False): i for i in left}
+        client, comm = self._dask.client, self._dask.comm
+        lost = (self._dask.scheduler.KilledWorker, client.FutureCancelledError, client.FuturesCancelledError, comm.CommClosedError)
+        try:
+            if self._sent is None:
+                self._sent = self._client.scatter(self._content, broadcast=True, hash=False)
+            waiting = {self._client.submit(_with, function, self._sent, tasks[i], pure=False): i for i in left}
+        except (OSError, TimeoutError) as error:
+            raise InputError(f"--executor {self._address}", f"the scheduler is gone ({error or type(error).__name__})",
+                             "start it again; the same command then goes on from what was stored") from None
         try:
             for future in self._dask.as_completed(list(waiting), loop=self._client.loop):
+                number = waiting.pop(future)
                 try:
                     answer = future.result()
                 except lost:
+                    self._sent = None  # every worker that held the data may be gone
                     continue
-                yield waiting[future], answer
+                yield number, answer
         finally:
-            self._client.cancel(list(waiting))
+            if waiting:
+                self._client.cancel(list(waiting))
 
-    def close(self) -> None:
+    def close(self, hurry: bool = False) -> None:
         self._client.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.executors import packed
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.fit import fit
 from bayes_nlsid.identification.problem import Problem
@@ -21,7 +23,7 @@ from bayes_nlsid.inference import convergence as cv
 from bayes_nlsid.inference.likelihood import GaussianResidual, PlainLikelihood, WhittleLikelihood, frequency_blocks, laplace
 from bayes_nlsid.inference.posterior import Posterior, load
 from bayes_nlsid.inference.prior import Prior, check_priors, default_priors, log_prior
-from bayes_nlsid.inference.target import Target, pack, unpack
+from bayes_nlsid.inference.target import Target
 from bayes_nlsid.model import Element, Model
 from tests.identification.truth import beam, prescribed
 from tests.identification.truth import pack as modal
@@ -311,4 +313,4 @@ def test_draws_and_quantiles():
 def test_a_target_travels_to_another_process():
     target = Target(WhittleLikelihood(lend(2)), default_priors(lend(2).problem))
     s = target.to_s(lend(2).theta)[None]
-    assert np.array_equal(unpack(pack(target))(s), target(s))
+    assert np.array_equal(pickle.loads(packed(target))(s), target(s))

@@ -7,12 +7,9 @@ distance to the anchor without paying for it, and gives a Gaussian in five dimen
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -21,6 +18,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.executors import Crew
 from bayes_nlsid.identification.fit import Fit
 from bayes_nlsid.inference.block import Block, Walkers
 from bayes_nlsid.inference.checkpoint import Checkpoints, identity
@@ -29,7 +27,7 @@ from bayes_nlsid.inference.likelihood import Likelihood, WhittleLikelihood
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
 from bayes_nlsid.inference.starting import centres, first_walkers, starting_fits
-from bayes_nlsid.inference.target import Target, pack, unpack
+from bayes_nlsid.inference.target import Target
 
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
 KEEP_FAILED = 20   # failed points remembered per block
@@ -121,6 +119,11 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
                  final_state, count[0], failed_at)
 
 
+def _advance(target: Target, task: tuple[Walkers, int]) -> Block:
+    """The same as a task that can be given away."""
+    return run_block(target, *task)
+
+
 # -- the run -------------------------------------------------------------------------------------------------------------------------
 
 MOST_STEPS, BLOCK = 20_000, 200
@@ -133,7 +136,7 @@ Progress = Callable[[float, str], None]
 def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[Prior] | None = None, ensembles: int = 4,
            walkers: int | None = None, steps: int | None = None, most: int = MOST_STEPS, block: int = BLOCK, seed: int = 0,
            store: Path | str | None = None, progress: Progress | None = None, stop: Callable[[], bool] | None = None,
-           workers: int = 1) -> Posterior:
+           executor: str | Executor = "local", workers: int = 1) -> Posterior:
     """Draw from the posterior of a fitted problem.
 
     Burn-in ends after ten autocorrelation times (at least 400 steps, at most a quarter of ``most``). During it walkers that stand still
@@ -166,8 +169,8 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
         Called with the share done and a sentence.
     stop : callable or None
         Asked after every block; True ends the run with what there is, as does Ctrl-C.
-    workers : int
-        Processes over which ensembles are spread. The draws do not depend on it.
+    executor, workers
+        Over whom ensembles are spread, as in ``executors.Crew``. The draws do not depend on it.
 
     Returns
     -------
@@ -197,8 +200,8 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
     states = [Walkers(s, value, generator) for (s, value), generator in zip(starts, generators, strict=True)]
     kept = Checkpoints(Path(store), identity(target, starts, (seed, ensembles, count, block))) if store is not None else None
     run = _Run(target, block, most, steps, third, kept, progress, stop)
-    with _pool(target, min(workers, ensembles)) as pool:
-        return run.go(states, pool).posterior(seed)
+    with Crew(target, executor=executor, workers=min(workers, ensembles)) as crew:
+        return run.go(states, crew).posterior(seed)
 
 
 @final
@@ -221,11 +224,11 @@ class _Run:
     next_check: int = 0
     began: float = field(default_factory=time.monotonic)
 
-    def go(self, states: list[Walkers], pool: Executor | None) -> _Run:
+    def go(self, states: list[Walkers], crew: Crew) -> _Run:
         """Run blocks until the rule holds, the budget is spent or somebody stops it."""
         try:
             while (len(self.blocks) + 1) * self.block <= self.most:
-                self.blocks.append(self._one_block(states, pool))
+                self.blocks.append(self._one_block(states, crew))
                 states = [b.end for b in self.blocks[-1]]
                 if self.burn_blocks is None:
                     states = self._burn_in(states)
@@ -239,21 +242,15 @@ class _Run:
             self.stopped = "stopped from the keyboard"
         return self
 
-    def _one_block(self, states: list[Walkers], pool: Executor | None) -> list[Block]:
+    def _one_block(self, states: list[Walkers], crew: Crew) -> list[Block]:
         number = len(self.blocks)
-        ready = [self.kept.read(i, number) if self.kept is not None else None for i in range(len(states))]
-        waiting: dict[int, Future[Block]] = {}
-        if pool is not None:
-            waiting = {i: pool.submit(_advance, state, self.block) for i, state in enumerate(states) if ready[i] is None}
-        out = []
-        for i, state in enumerate(states):
-            done = ready[i]
-            if done is None:
-                done = waiting[i].result() if pool is not None else run_block(self.target, state, self.block)
-                if self.kept is not None:
-                    self.kept.write(i, number, done)
-            out.append(done)
-        return out
+        done = {i: block for i in range(len(states)) if self.kept is not None and (block := self.kept.read(i, number)) is not None}
+        todo = [i for i in range(len(states)) if i not in done]
+        for k, block in crew.run(_advance, [(states[i], self.block) for i in todo]):
+            done[todo[k]] = block
+            if self.kept is not None:
+                self.kept.write(todo[k], number, block)
+        return [done[i] for i in range(len(states))]
 
     def _chain(self, first: int) -> tuple[Array, Array, Array]:
         """Draws (M, N, W, P), log densities (M, N, W) and acceptance (M, W) from a block on."""
@@ -335,46 +332,3 @@ class _Run:
                          value[:, thin - 1::thin], convergence, priors, seed, self.target.likelihood.describe(), first * self.block,
                          sum(b.failures for row in self.blocks for b in row),
                          np.concatenate(failed)[:KEEP_FAILED] if failed else np.zeros((0, len(priors))))
-
-
-# -- other processes -----------------------------------------------------------------------------------------------------------------
-
-_TARGET: list[Target] = []    # filled once in each worker process, so that recordings travel once and not with every block
-
-
-def _install(content: bytes) -> None:
-    _TARGET[:] = [unpack(content)]
-
-
-def _advance(state: Walkers, steps: int) -> Block:
-    return run_block(_TARGET[0], state, steps)
-
-
-def _ready() -> bool:
-    return bool(_TARGET)
-
-
-@contextmanager
-def _pool(target: Target, workers: int) -> Iterator[Executor | None]:
-    """Spawned processes with one thread each, or None for one worker: the ensembles then run here."""
-    if workers == 1:
-        yield None
-        return
-    content = pack(target)
-    single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
-    before = {name: os.environ.get(name) for name in single}
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_install, initargs=(content,))
-    try:
-        os.environ.update(single)
-        try:
-            for future in [pool.submit(_ready) for _ in range(workers)]:   # start the processes while the environment is set
-                future.result()
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,17 +1,13 @@
-"""The log posterior in search coordinates, and how it travels to another process."""
+"""The log posterior in search coordinates."""
 
 from __future__ import annotations
 
-import io
-import pickle
 from dataclasses import dataclass, field
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayes_nlsid.forces.library import LIBRARY, find_term
-from bayes_nlsid.forces.term import Term
 from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.inference.likelihood import Likelihood
@@ -80,38 +76,3 @@ class Target:
     def __call__(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log density (W,) of s (W, P)."""
         return self.parts(np.asarray(s, dtype=float))[0]
-
-
-@final
-class _Pickler(pickle.Pickler):
-    """Sends a term of the library as its name: its law may be a function made inside another, which pickle cannot name."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        """Name instead of content for library terms."""
-        if isinstance(obj, Term) and LIBRARY.get(obj.name) is obj:
-            return find_term, (obj.name,)
-        return NotImplemented
-
-
-def pack(target: Target) -> bytes:
-    """Bytes of a target for another process.
-
-    Raises
-    ------
-    ValueError
-        If a force law cannot be sent.
-    """
-    buffer = io.BytesIO()
-    try:
-        _Pickler(buffer).dump(target)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ValueError(f"the model cannot be sent to another process ({error}); use workers=1, or terms of the library") from error
-    return buffer.getvalue()
-
-
-def unpack(content: bytes) -> Target:
-    """Target from ``pack``, in a process of this package's own making."""
-    target = pickle.loads(content)
-    if not isinstance(target, Target):
-        raise ValueError(f"expected a Target, got {type(target).__name__}")
-    return target

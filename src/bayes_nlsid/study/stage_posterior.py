@@ -46,7 +46,7 @@ def posterior(context: Context) -> Result:
     checkpoints = context.checkpoints("posterior")
     found = sample(start, likelihood=likelihood, priors=priors, ensembles=entry.ensembles, steps=entry.steps, walkers=entry.walkers,
                    most=entry.most or MOST_STEPS, seed=context.number("posterior"), store=checkpoints, progress=context.progress,
-                   workers=context.workers)
+                   executor=context.executor, workers=context.workers)
     if any("stopped from the keyboard" in reason for reason in found.reasons):
         raise KeyboardInterrupt  # half a posterior is not a result; its checkpoints stay for the next run
     rng = np.random.default_rng(context.random("prior"))
