@@ -9,6 +9,7 @@ import pytest
 
 from bayes_nlsid.prediction.continuation import response_curves
 from bayes_nlsid.prediction.response_bands import response_bands
+from tests.prediction.test_stability import INTERACTING
 from tests.simulation.problems import oscillator
 
 OPTIONS = {"drive": "x", "at": "x", "levels": [1.0, 6.0], "band": (8.0, 14.0)}
@@ -37,6 +38,21 @@ def test_harmonics_are_added_until_more_do_not_matter() -> None:
     chosen = response_bands([[4e3, 0.02]], model, **options)  # type: ignore[arg-type]
     assert one.harmonics == 1 and one.harmonic_error[0] > chosen.harmonic_error[0]
     assert chosen.harmonics >= 7 and chosen.harmonic_error[0] < 2e-3
+
+
+def test_where_stability_is_lost_sweeps_have_no_value_and_it_is_counted() -> None:
+    found = response_bands([[2e5], [2.001e5]], INTERACTING, drive="x", at="x", levels=[0.5, 4.0], band=(8.0, 20.0), harmonics=5)
+    assert found.status == {"ok": 4} and found.lost == {"a second frequency appears": 2} and found.judged_by == "multipliers"
+    gap = np.isnan(found.up[1]) & (found.frequency > 8.0) & (found.frequency < 20.0)
+    assert not gap[0].any() and gap[1].any()
+    assert found.frequency[gap[1]].min() > 10.1 and found.frequency[gap[1]].max() < 10.35
+    assert not found.arrays()["curve1_stable"].all()
+
+
+def test_a_peak_that_no_sweep_sees_is_no_peak() -> None:
+    model = replace(INTERACTING, linear=replace(INTERACTING.linear, zeta=np.array([0.02, -0.001])))
+    found = response_bands([[1e3]], model, drive="x", at="x", levels=[0.5], band=(8.0, 13.0), harmonics=3)
+    assert found.status == {"the motion at the peak is not stable: a second frequency appears": 1} and np.isnan(found.peak_frequency).all()
 
 
 def test_a_gain_of_the_force_is_applied() -> None:

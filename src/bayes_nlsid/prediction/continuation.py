@@ -13,7 +13,7 @@ Gross 2019, chapter 4). Lengths are relative to the motion at the point, so that
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -21,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayes_nlsid.model import Model
 from bayes_nlsid.prediction.harmonics import Basis, SteadyForces, orders_for, period_samples
+from bayes_nlsid.prediction.response_curve import Curve
+from bayes_nlsid.prediction.stability import has_multipliers, multipliers
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -38,94 +40,8 @@ FLOOR = 0.02
 FAILED, FINER = "the corrector failed", 4
 
 
-@final
-@dataclass(frozen=True)
-class Curve:
-    """Steady responses along one curve, in the order in which it was followed from the lower end of the band.
-
-    Parameters
-    ----------
-    frequency : ndarray (n,)
-        Hz; it turns back where the curve folds.
-    locations : tuple of str, length L
-        Where elements act, and the location asked for.
-    coefficients : ndarray (n, L, C)
-        m, of the functions of ``basis``.
-    basis : Basis
-    level : float
-        Amplitude of the force, N.
-    status : str
-        ``"ok"``: the whole band; else where and why it ends.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree.
-    """
-
-    frequency: Array
-    locations: tuple[str, ...]
-    coefficients: Array
-    basis: Basis
-    level: float
-    status: str
-
-    def __post_init__(self) -> None:
-        shape = (len(self.frequency), len(self.locations), self.basis.size)
-        if self.coefficients.shape != shape:
-            raise ValueError(f"curve: coefficients have shape {self.coefficients.shape}, expected {shape}")
-
-    def harmonic(self, location: str, order: int = 1) -> Complex:
-        """Complex amplitude (n,) of one harmonic of the displacement, m, relative to the force F cos Ωt."""
-        values = self.basis.complex(self.coefficients[:, self.locations.index(location)])
-        return values[:, self.basis.orders.index(order)]
-
-    def largest(self, location: str) -> Array:
-        """Largest displacement (n,) over the period, m."""
-        fine = self.basis.at(np.linspace(0, 2 * np.pi, 512, endpoint=False))
-        return np.asarray(np.abs(self.coefficients[:, self.locations.index(location)] @ fine.T).max(axis=1))
-
-    def peak(self, location: str) -> tuple[float, float]:
-        """Frequency (Hz) and amplitude (m) where the fundamental is largest, by a parabola along the curve; NaN without points."""
-        size = np.abs(self.harmonic(location))
-        if not size.size:
-            return float("nan"), float("nan")
-        i = int(np.argmax(size))
-        if not 0 < i < len(size) - 1:
-            return float(self.frequency[i]), float(size[i])
-        near = slice(i - 1, i + 2)
-        f, z = self.frequency[near], self.harmonic(location)[near]
-        # length along the curve, of relative motion and of frequency in turn: whichever moves
-        gap = np.abs(np.diff(z)) / size[i] + np.abs(np.diff(f)) / f[1]
-        along = np.array([-gap[0], 0.0, gap[1]])
-        square = np.polyfit(along, size[near] ** 2, 2)
-        best = float(np.clip(-square[1] / (2 * square[0]), along[0], along[2])) if square[0] < 0 else 0.0
-        return float(np.polyval(np.polyfit(along, f, 2), best)), float(np.sqrt(np.polyval(square, best)))
-
-    def swept(self, location: str, frequency: Array, down: bool = False) -> Array:
-        """Fundamental amplitude (K,), m, that a slow sweep meets at ascending frequencies (K,), Hz; NaN where the curve does not reach.
-
-        A sweep stays on its branch up to the turning point and jumps there: upwards it meets the first point of the curve at each
-        frequency, downwards the last.
-        """
-        f, size = self.frequency, np.abs(self.harmonic(location))
-        if down:
-            f, size = -f[::-1], size[::-1]
-        ahead = np.maximum.accumulate(f)
-        reached = np.flatnonzero(np.diff(ahead, prepend=-np.inf) > 0)
-        wanted = -np.asarray(frequency)[::-1] if down else np.asarray(frequency)
-        upper = np.searchsorted(ahead[reached], wanted)
-        inside = (upper > 0) & (upper < len(reached))
-        high = reached[np.clip(upper, 1, len(reached) - 1)] if len(reached) > 1 else np.zeros(len(wanted), dtype=int)
-        low = np.maximum(high - 1, 0)
-        share = (wanted - f[low]) / np.where(f[high] > f[low], f[high] - f[low], 1.0)
-        out = np.where(inside & (high > low), size[low] + share * (size[high] - size[low]), np.nan)
-        out = np.where(wanted == f[0], size[0], out)
-        return out[::-1] if down else out
-
-
 def response_curves(model: Model, theta: ArrayLike, *, drive: str, at: str, levels: ArrayLike, band: tuple[float, float],
-                    harmonics: int = 7, samples: int | None = None, most_points: int = MOST_POINTS,
+                    harmonics: int = 7, samples: int | None = None, most_points: int = MOST_POINTS, stability: bool = True,
                     progress: Callable[[float], None] | None = None) -> list[list[Curve]]:
     """Response curves under a sine force, for every sample of theta at every level.
 
@@ -145,6 +61,8 @@ def response_curves(model: Model, theta: ArrayLike, *, drive: str, at: str, leve
         Instants per period at which forces are evaluated; None: as the laws need, four times as many where that fails.
     most_points : int
         Points after which a curve is given up.
+    stability : bool
+        Whether Floquet multipliers are computed; they are not where a force has memory.
     progress : callable or None
         Share of the band done by the slowest curve.
 
@@ -183,6 +101,9 @@ def response_curves(model: Model, theta: ArrayLike, *, drive: str, at: str, leve
     if failed.size:  # at kinks a coarse period is jagged
         for i, again in zip(failed, trace(failed, FINER * first), strict=True):
             curves[i] = again
+    if stability and has_multipliers(model):
+        found = multipliers(model, every, curves)
+        curves = [replace(curve, multiplier=one) for curve, one in zip(curves, found, strict=True)]
     curves = [replace(curve, level=float(force[i % count])) for i, curve in enumerate(curves)]
     return [curves[i * count:(i + 1) * count] for i in range(len(values))]
 

@@ -185,6 +185,27 @@ class SteadyForces:
                 by_x[:, r] -= spring[:, None, None] * np.eye(basis.size)
         return force, by_x, by_omega
 
+    def slopes(self, x: Array, omega: Array, which: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Slopes ∂f/∂q (N/m) and ∂f/∂v (N s/m), each (B, R, N), of forces without memory along the period; arguments as `evaluate`.
+
+        Raises
+        ------
+        ValueError
+            If a force has memory: what it answers to a disturbance depends on more than the instant.
+        """
+        shape = (*x.shape[:2], self.basis.samples)
+        stiffness, damping = np.zeros(shape), np.zeros(shape)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for place in self.places:
+                if place.term.memory != "none":
+                    raise ValueError(f"{place.term.name} has memory; its slope at an instant does not tell what it answers")
+                r = place.row
+                q, v = x[:, r] @ self.basis.wave.T, omega[:, None] * (x[:, r] @ self.basis.slope.T)
+                _, fq, fv = _static(place, q, v, place.p[which])
+                stiffness[:, r] += fq - place.spring[which, None]
+                damping[:, r] += fv
+        return stiffness, damping
+
 
 def _columns(p: Array) -> tuple[Array, ...]:
     """Parameters (B, n_p) as columns that broadcast over instants."""

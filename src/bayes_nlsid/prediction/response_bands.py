@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from bayes_nlsid.executors import run_tasks
 from bayes_nlsid.model import Model
 from bayes_nlsid.prediction.bands import LEVELS, Drawable, quantiles
-from bayes_nlsid.prediction.continuation import Curve, response_curves
+from bayes_nlsid.prediction.continuation import response_curves
+from bayes_nlsid.prediction.response_curve import Curve
+from bayes_nlsid.prediction.stability import has_multipliers
 
 Array = NDArray[np.float64]
 HARMONICS = 7
@@ -38,7 +40,7 @@ class ResponseBands:
         Hz, ascending; denser where the curves are steep.
     up, down : ndarray (3, F, K)
         Fundamental amplitude of displacement, m, at the levels 0.05, 0.5, 0.95, met by a slow sweep upwards and downwards; NaN where
-        fewer than 90 % of the usable samples have a value.
+        fewer than 90 % of the usable samples have a value, as where their steady motion is not stable.
     samples_up, samples_down : ndarray (S, F, K)
     peak_frequency, peak_amplitude : ndarray (S, F)
         Hz and m at the largest response in the band; NaN where a curve failed.
@@ -46,6 +48,10 @@ class ResponseBands:
         Whole curves, unstable parts included, of one sample: the draw nearest to the median of the peaks.
     status : dict of str to int
         How many of the S × F curves ended how; only ``"ok"`` enter the quantiles.
+    lost : dict of str to int
+        On how many of them the motion loses its stability elsewhere than at a turning point, and how.
+    judged_by : {"multipliers", "turning points"}
+        How stability was found; with memory only turning points are known.
     harmonics : int
     harmonic_error : ndarray (F,)
         Relative change of the median's peak (amplitude or frequency, whichever is larger) when about twice as many harmonics carry it.
@@ -67,6 +73,8 @@ class ResponseBands:
     peak_amplitude: Array
     curves: tuple[Curve, ...]
     status: dict[str, int]
+    lost: dict[str, int]
+    judged_by: str
     harmonics: int
     harmonic_error: Array
     drive: str
@@ -89,7 +97,9 @@ class ResponseBands:
         for i, curve in enumerate(self.curves):
             motion = curve.harmonic(self.location)
             out |= {f"curve{i}_frequency": curve.frequency, f"curve{i}_amplitude": np.abs(motion), f"curve{i}_phase": np.angle(motion),
-                    f"curve{i}_largest": curve.largest(self.location)}
+                    f"curve{i}_largest": curve.largest(self.location), f"curve{i}_stable": curve.stable}
+            if curve.multiplier is not None:
+                out[f"curve{i}_multiplier"] = curve.multiplier
         return out
 
 
@@ -139,34 +149,41 @@ def response_bands(draws: ArrayLike | Drawable, model: Model, *, drive: str, at:
     for number, answer in run_tasks(_chunk, shared, parts, executor=executor, workers=workers):
         found[number] = answer
         told(0.1 + 0.85 * len(found) / len(parts), f"response curves of {min(CHUNK * len(found), len(theta))} of {len(theta)} samples")
-    up, down, peak, ended = (np.concatenate([found[i][k] for i in range(len(parts))]) for k in range(4))
+    up, down, peak, ended, lost = (np.concatenate([found[i][k] for i in range(len(parts))]) for k in range(5))
     ok = ended == "ok"
-    up, down = (np.where(ok[..., None], values, np.nan) for values in (up, down))
+    up, down, peak = (np.where(ok[..., None], values, np.nan) for values in (up, down, peak))
     bands = [np.stack([quantiles(values[:, i], ok[:, i]) for i in range(len(level))], axis=1) for values in (up, down)]
-    counts = {str(name): int((ended == name).sum()) for name in np.unique(ended)}
     nearest = _middle(peak, ok)
     shown = response_curves(model, theta[nearest], **common, harmonics=highest)[0]
-    return ResponseBands(level, grid, bands[0], bands[1], up, down, peak[..., 0], peak[..., 1], tuple(shown), counts, highest, error, drive,
-                         at)
+    judged_by = "multipliers" if has_multipliers(model) else "turning points"
+    return ResponseBands(level, grid, bands[0], bands[1], up, down, peak[..., 0], peak[..., 1], tuple(shown), _counts(ended),
+                         _counts(lost[lost != ""]), judged_by, highest, error, drive, at)
 
 
 def _silent(share: float, sentence: str) -> None:
     """No progress."""
 
 
-def _chunk(shared: tuple[Model, dict[str, Any], Array], theta: Array) -> tuple[Array, Array, Array, NDArray[np.str_]]:
-    """Swept responses (s, F, K) up and down, peaks (s, F, 2), endings (s, F) of some samples."""
+def _counts(names: NDArray[np.str_]) -> dict[str, int]:
+    return {str(name): int((names == name).sum()) for name in np.unique(names)}
+
+
+def _chunk(shared: tuple[Model, dict[str, Any], Array], theta: Array) -> tuple[NDArray[Any], ...]:
+    """Swept responses (s, F, K) up and down, peaks (s, F, 2), endings and losses of stability (s, F) of some samples."""
     model, options, grid = shared
     every = response_curves(model, theta, **options)
     at, shape = options["at"], (len(theta), len(options["levels"]))
     up, down, peak = np.full((*shape, len(grid)), np.nan), np.full((*shape, len(grid)), np.nan), np.full((*shape, 2), np.nan)
-    ended = np.array([[_kind(curve.status) for curve in curves] for curves in every], dtype="<U64").reshape(shape)
+    ended = np.array([[_kind(curve.status) for curve in curves] for curves in every], dtype="<U96").reshape(shape)
+    lost = np.array([[curve.lost if curve.status == "ok" else "" for curve in curves] for curves in every], dtype="<U32").reshape(shape)
     for s, curves in enumerate(every):
         for f, curve in enumerate(curves):
             if curve.status == "ok":
                 up[s, f], down[s, f] = curve.swept(at, grid), curve.swept(at, grid, down=True)
                 peak[s, f] = curve.peak(at)
-    return up, down, peak, ended
+                if not curve.peak_stands(at):
+                    ended[s, f] = f"the motion at the peak is not stable: {curve.lost or 'it lies beyond a turning point'}"
+    return up, down, peak, ended, lost
 
 
 def _kind(status: str) -> str:
@@ -177,7 +194,7 @@ def _kind(status: str) -> str:
 def _enough_harmonics(model: Model, theta: Array, given: int | None, common: dict[str, Any]) -> tuple[int, Array, list[Curve]]:
     """The number of harmonics, what more of them would change (F,), and the curves of theta (P,) with the most."""
     def curves(highest: int) -> list[Curve]:
-        return response_curves(model, theta, **common, harmonics=highest)[0]
+        return response_curves(model, theta, **common, harmonics=highest, stability=False)[0]
 
     highest = given if given is not None else HARMONICS
     few = curves(highest)

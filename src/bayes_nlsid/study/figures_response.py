@@ -40,7 +40,9 @@ def response_curves(arrays: Mapping[str, Array], summary: Mapping[str, Any]) -> 
             low, high = (factor * arrays[f"{way}_{q}"][i] / level[i] for q in ("q05", "q95"))
             if not np.array_equal(low, high, equal_nan=True):
                 left.fill_between(arrays["frequency"], low, high, color=color, alpha=0.22, linewidth=0)
-        left.plot(arrays[f"curve{i}_frequency"], factor * arrays[f"curve{i}_amplitude"] / level[i], color=color, linewidth=1.1,
+        frequency, curve = arrays[f"curve{i}_frequency"], factor * arrays[f"curve{i}_amplitude"] / level[i]
+        left.plot(frequency, curve, color=color, linewidth=0.8, linestyle=(0, (1, 1.6)))
+        left.plot(frequency, np.where(arrays[f"curve{i}_stable"], curve, np.nan), color=color, linewidth=1.1,
                   label=engineering(float(level[i]), "N"))
     left.set(xlabel="frequency (Hz)", ylabel=f"displacement at {summary['output']} per force ({unit}/N)", ylim=(0, None))
     _zoom(left, arrays, shown)

@@ -22,7 +22,7 @@ def response_curves(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
         return []
     several = summary["samples"] > 1
     caption = (f"Response at {summary['output']} to a slowly stepped sine force at {summary['input']}, per force: lines are whole curves "
-               "of the draw nearest to the median, parts between turning points included. "
+               "of the draw nearest to the median, dotted where the motion is not stable. "
                + (f"{CAPTION_BAND} Shaded: what sweeps upwards and downwards meet. " if several else "")
                + "Right: where the peak lies at each level.")
     return [Picture("response_curves", "frf", caption, "stages/frf, frf.npz", png(draw, arrays, summary))]

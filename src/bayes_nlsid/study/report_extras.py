@@ -19,7 +19,9 @@ def response_section(done: Mapping[str, Saved]) -> str:
     head = ["force", "peak at (Hz)", "5–95 %", f"amplitude at {summary['output']}", "5–95 %", "more harmonics would change"]
     out = html.table(head, response_rows(summary), "stages/frf, frf.npz", numeric=(0, 1, 2, 3, 4, 5))
     said = (f"A sine force at {summary['input']}, {summary['samples']} draws of the posterior, harmonics up to {summary['harmonics']}; "
-            "harmonic balance followed along each curve past its turning points.")
+            "harmonic balance followed along each curve past its turning points. Whether a motion is stable was found "
+            + ("by the growth of disturbances over a period." if summary["stability"] == "multipliers"
+               else "from the turning points alone, since forces have memory."))
     return html.paragraph(said, "soft") + out + html.listing(summary["reasons"])
 
 
