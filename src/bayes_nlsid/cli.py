@@ -71,6 +71,8 @@ def _parser() -> argparse.ArgumentParser:
         extra = add(name, f"{what}; the run comes first where it is missing", _extra, out=True)
         extra.add_argument("study", metavar="STUDY.toml")
         extra.add_argument("--fresh", action="store_true", help="compute this again; the run itself is kept")
+    add("plan", "before a test: which sensors, place and level of excitation let the joints be learned, and what cannot be", _plan,
+        out=True).add_argument("study", metavar="STUDY.toml")
     report = add("report", "write report.html again from stored results", _report)
     report.add_argument("out", metavar="DIR")
     add("terms", "the library of force laws as a table", _terms)
@@ -116,11 +118,11 @@ def _executor(text: str) -> str:
     raise argparse.ArgumentTypeError(f"{text!r} is neither local nor dask://HOST:PORT")
 
 
-def _reporter(options: argparse.Namespace, out: Path) -> Any:
+def _reporter(options: argparse.Namespace, out: Path | None) -> Any:
     from bayes_nlsid.study.progress import Reporter
 
     terminal = sys.stderr if sys.stderr.isatty() and not options.quiet else None
-    logs = [out / "run.log"]
+    logs = [] if out is None else [out / "run.log"]
     if options.log:
         extra = Path(options.log)
         if not extra.parent.is_dir():
@@ -170,6 +172,20 @@ def _check(options: argparse.Namespace) -> int:
     study = read_study(options.study)
     print(plan(study, examine(study)))
     return DONE
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from bayes_nlsid.study.planning import run_plan, sentences
+    from bayes_nlsid.study.reading import read_study
+
+    out = Path(options.out)
+    reporter = _reporter(options, None)
+    reporter.begin(1, 1, "plan", options.study)
+    said = run_plan(read_study(options.study), out, seed=options.seed, progress=reporter.update)
+    reporter.end(0.0, reused=False)
+    if not options.quiet:
+        print("\n".join([*sentences(said), f"\nin {out}: plan.html, plan.json, figures/"]))
+    return DONE if any(e["status"] == "ok" for e in said["excitations"]) else REFUSED
 
 
 def _report(options: argparse.Namespace) -> int:

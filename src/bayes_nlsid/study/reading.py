@@ -12,6 +12,7 @@ from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
 from bayes_nlsid.recordings.units import unit_factor
 from bayes_nlsid.study.reading_extras import read_frf, read_montecarlo
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
+from bayes_nlsid.study.reading_plan import read_plan
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
 from bayes_nlsid.study.schema import IdentificationEntry, LinearEntry, Study
 from bayes_nlsid.study.store import file_digest
@@ -54,7 +55,8 @@ def read_study(path: Path | str) -> Study:
     structure, locations = read_structure(outline)
     reduction = read_reduction(top.table("reduction"), structure)
     terms = read_terms(top)
-    recordings = _read_recordings(top, locations)
+    plan = read_plan(top.table("plan"), locations, terms)
+    recordings = _read_recordings(top, locations, needed=plan is None)
     linear = _read_linear(top.table("linear"), recordings, locations)
     identification = read_identification(top.table("identification"), locations, terms)
     _check_modes(file, identification, 1 if structure.kind == "oscillator" else reduction.modes or 10)
@@ -72,7 +74,7 @@ def read_study(path: Path | str) -> Study:
     files = dict.fromkeys([*(p for _, p in structure.files), *others, *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
     return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
-                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs))
+                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan)
 
 
 def _parse(file: Path) -> dict[str, Any]:
@@ -115,14 +117,14 @@ def _check_modes(file: Path, entry: IdentificationEntry | None, count: int) -> N
                          "raise modes in [reduction], or name lower ones")
 
 
-def _read_recordings(top: Table, locations: Sequence[str]) -> tuple[RecordingSpec, ...]:
+def _read_recordings(top: Table, locations: Sequence[str], *, needed: bool = True) -> tuple[RecordingSpec, ...]:
     entries: list[RecordingSpec] = []
     for table in top.tables("recordings"):
         entry = _read_recording(table, entries, locations)
         if any(entry.name == other.name for other in entries):
             raise table.wrong("name", f"{entry.name!r} is used twice", "give every recording a name of its own")
         entries.append(entry)
-    if not entries:
+    if needed and not entries:
         raise InputError(f"{top.file.name}: [[recordings]]", "there is none", "add at least one [[recordings]] entry")
     return tuple(entries)
 

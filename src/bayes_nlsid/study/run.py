@@ -64,6 +64,8 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
     """
     if extra is not None and getattr(study, extra) is None:
         raise InputError(f"{study.file.name}: [{extra}]", "is missing", f"add [{extra}] with {_NEEDED[extra]}")
+    if not study.recordings:
+        raise InputError(f"{study.file.name}: [[recordings]]", "there is none, so there is nothing to run", "add one, or use nlsid plan")
     store = Store(out)
     with writing(store.out), store.lock():
         store.sweep()

@@ -279,6 +279,33 @@ class ReportEntry:
 
 @final
 @dataclass(frozen=True)
+class PlanJointEntry:
+    """``[[plan.joints]]``: a suspected joint with assumed values of its parameters, SI."""
+
+    term: str
+    locations: tuple[str, ...]
+    values: tuple[tuple[str, float], ...]
+    tied: bool = False
+    excess: bool = True
+
+
+@final
+@dataclass(frozen=True)
+class PlanEntry:
+    """``[plan]``: places for sensors and shaker, band (Hz), rms levels (N), rms noise of a sensor in the band (SI), record length (s)."""
+
+    sensors: tuple[str, ...]
+    inputs: tuple[str, ...]
+    band: tuple[float, float]
+    levels: tuple[float, ...]
+    noise: float
+    seconds: float
+    quantity: str
+    joints: tuple[PlanJointEntry, ...]
+
+
+@final
+@dataclass(frozen=True)
 class Study:
     """A whole study file.
 
@@ -319,6 +346,7 @@ class Study:
     montecarlo: MonteCarloEntry | None = None
     locations: tuple[str, ...] = ()
     inputs: tuple[tuple[str, str], ...] = ()
+    plan: PlanEntry | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:
