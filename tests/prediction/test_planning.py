@@ -23,19 +23,24 @@ def plan(linear: ModalModel, elements: list[Element], values: list[float], **cha
     return plan_test(linear, elements, values, **given)  # type: ignore[arg-type]
 
 
-def test_the_information_about_a_spring_is_that_of_its_transfer_function() -> None:
-    """a = −ω² F/(k + …), so da/d ln k = k ω² H² F; noise variance and lines as stated. Frequency and damping are known here."""
+@pytest.mark.parametrize(("zeta", "within"), [(ZETA, 0.02), (0.001, 0.2)])
+def test_the_information_about_a_spring_is_that_of_its_transfer_function(zeta: float, within: float) -> None:
+    """a = −ω² F/(k + …), so da/d ln k = k ω² H² F; noise variance and lines as stated. Frequency and damping are known here.
+
+    A sharp resonance is moved between lines by the integrator's period error, which is all that remains: it falls with the step.
+    """
     k = 2000.0
-    found = plan(X, [Element(find_term("spring"), ("x",), excess=False)], [k], band=(12.0, 40.0))
+    found = plan(oscillator(mass=1.0, frequency=F0, zeta=zeta, location="x"), [Element(find_term("spring"), ("x",), excess=False)], [k],
+                 band=(12.0, 40.0))
     information = found.excitations[0].information[0]
     at = found.names.index("spring[x].k")
-    period = 1 / (2 * ZETA * F0)
-    lines = np.arange(15, 51) / period
+    period = 1 / (2 * zeta * F0)
+    lines = np.arange(round(12 * period), round(40 * period) + 1) / period
     omega, omega0 = 2 * np.pi * lines, 2 * np.pi * F0
-    H = 1 / (omega0**2 + k - omega**2 + 2j * ZETA * omega0 * omega)
+    H = 1 / (omega0**2 + k - omega**2 + 2j * zeta * omega0 * omega)
     amplitude = np.sqrt(2 / len(lines))  # of each line for rms 1
     expected = np.sum((k * omega**2 * np.abs(H) ** 2 * amplitude) ** 2) * 10.0 * 28.0 / 0.01**2
-    assert information[at, at] == pytest.approx(expected, rel=0.02)
+    assert information[at, at] == pytest.approx(expected, rel=within)
 
 
 def test_more_noise_shorter_records_and_weaker_forces_teach_less_by_the_known_factor() -> None:
@@ -88,3 +93,6 @@ def test_bad_plans_are_refused() -> None:
         plan(X, element, [-1.0])
     with pytest.raises(ValueError, match="unknown locations"):
         plan(X, element, [1.0], sensors=("y",))
+    undamped = replace(X, zeta=np.zeros(1))
+    with pytest.raises(ValueError, match="too little for its motion to be computed until it is steady"):
+        plan(undamped, element, [1.0])

@@ -21,13 +21,14 @@ from bayes_nlsid.simulation.integration import simulate
 from bayes_nlsid.structure.modal import ModalModel
 
 Array = NDArray[np.float64]
-STEP = 5e-3  # of ln p in central differences
+STEP = 0.1  # of ln p in central differences, as a share of the smallest damping ratio: small beside the width of a resonance
 DECADE = float(np.log(10.0))
 FREQUENCY_PRIOR, DAMPING_PRIOR = 0.05, 0.5
 """Standard deviations of ln before the test: of linear frequencies and damping; of joint parameters it is one decade."""
 LEARNED, ROUGHLY = 0.1, 0.5  # standard deviations of ln p up to which a parameter counts as learned, and as roughly learned
 UNSEEN = 0.5  # a direction whose standard deviation shrinks to no less than this share of the prior is not learned
 OVERSAMPLING = 20  # steps for one period of the highest frequency of the band
+MOST_SAMPLES = 2_000_000  # of one simulation
 HARMONICS = 3  # response is compared up to this multiple of the band
 
 
@@ -162,18 +163,18 @@ def plan_test(linear: ModalModel, elements: Sequence[Element], values: Sequence[
     Raises
     ------
     ValueError
-        If a value is not positive, no mode lies in the band, or a location is unknown.
+        If a value is not positive, no mode lies in the band, a mode is too lightly damped to become steady, or a location is unknown.
     """
     near = tuple(k for k, f in enumerate(linear.frequency) if 0.8 * band[0] <= f <= 1.2 * band[1])
     if not near:
         raise ValueError(f"no mode of the model lies between {band[0]:g} and {band[1]:g} Hz; its modes are at "
                          f"{', '.join(f'{f:.4g}' for f in linear.frequency)} Hz")
+    clock = _Clock.of(linear, near, band)
     model = Model(replace(linear, inputs=tuple(inputs)), tuple(elements), near)
     theta = model.start(values)
     if not (theta > 0).all():
         raise ValueError(f"values must be positive, got {list(values)}")
     places = tuple(dict.fromkeys(p for e in elements for p in e.locations))
-    clock = _Clock.of(linear, near, band)
     shape = _multisine(clock, band, np.random.default_rng(seed))
     found: list[Excitation] = []
     for i, where in enumerate(inputs):
@@ -205,10 +206,13 @@ class _Clock:
 
     @classmethod
     def of(cls, linear: ModalModel, near: Sequence[int], band: tuple[float, float]) -> _Clock:
-        """Periods that resolve the half-power width of the narrowest mode, between half a second and four."""
+        """Periods that resolve the half-power width of the narrowest mode; two of them are six of its time constants."""
         width = min(2 * linear.zeta[k] * linear.frequency[k] for k in near)
-        seconds = float(np.clip(1 / width, 0.5, 4.0))
         rate = OVERSAMPLING * band[1]
+        if not width > 0 or 3 * rate / width > MOST_SAMPLES:
+            raise ValueError(f"the narrowest mode of the band is {width:.2g} Hz wide, too little for its motion to be computed until it is "
+                             f"steady in a band up to {band[1]:g} Hz; state its damping ([linear] damping) or narrow the band")
+        seconds = max(1 / width, 0.5)
         period = round(seconds * rate)
         first, last = int(np.ceil(band[0] / 2 * seconds)), int(min(HARMONICS * band[1] * seconds, period // 2 - 1))
         return cls(rate, period, 2 * period, (max(first, 1), last))
@@ -228,7 +232,8 @@ def _excite(model: Model, theta: Array, force: Array, clock: _Clock, named: tupl
             places: tuple[str, ...], quantity: str, weight: float) -> Excitation:
     """Simulate at theta and around it; ``weight`` is record length over noise spectrum, s over (quantity² per Hz)."""
     size = model.size
-    steps = np.exp(STEP * np.concatenate([np.zeros((1, size)), np.eye(size), -np.eye(size)]))
+    step = STEP * float(model.linear.zeta[list(model.free_modes)].min())
+    steps = np.exp(step * np.concatenate([np.zeros((1, size)), np.eye(size), -np.eye(size)]))
     response = simulate(model, theta * steps, fs=clock.rate, samples=clock.total, force=force, scheme="exponential",
                         keep=(*sensors, *places), store=tuple({quantity, "displacement"}), skip=clock.settle)
     count = len(sensors)
@@ -238,7 +243,7 @@ def _excite(model: Model, theta: Array, force: Array, clock: _Clock, named: tupl
     signals = getattr(response, quantity)[:, -clock.period:, :count]
     first, last = clock.lines
     spectra = np.fft.rfft(signals, axis=1)[:, first:last + 1] / clock.period
-    slopes = (spectra[1:size + 1] - spectra[size + 1:]) / (2 * STEP)  # (P, lines, s)
+    slopes = (spectra[1:size + 1] - spectra[size + 1:]) / (2 * step)  # (P, lines, s)
     # a record of N samples holds N / period repetitions: 4 |J_N|² / (N fs S) with J_N = N J becomes 4 |J|² · seconds / S
     information = 4 * weight * np.einsum("pks,qks->spq", slopes.conj(), slopes).real
     moved = np.abs(response.displacement[0, -clock.period:, count:]).max(axis=0)
