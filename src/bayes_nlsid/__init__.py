@@ -40,6 +40,7 @@ _PUBLIC = {
     "response_curves": "prediction.continuation", "Curve": "prediction.continuation", "response_bands": "prediction.response_bands",
     "ResponseBands": "prediction.response_bands",
     "scattered_plan": "prediction.sampling_plan", "posterior_plan": "prediction.sampling_plan", "Plan": "prediction.sampling_plan",
+    "plan_test": "prediction.planning", "MeasurementPlan": "prediction.planning",
     "Decay": "prediction.montecarlo", "backbones": "prediction.montecarlo", "sobol": "prediction.sensitivity",
     "dependent_shares": "prediction.sensitivity",
     # whole studies

@@ -9,7 +9,7 @@ import pytest
 
 from bayes_nlsid.forces.library import find_term
 from bayes_nlsid.model import Element
-from bayes_nlsid.prediction.planning import DECADE, LEARNED, UNSEEN, Plan, plan_test
+from bayes_nlsid.prediction.planning import DECADE, LEARNED, UNSEEN, MeasurementPlan, plan_test
 from bayes_nlsid.structure.chains import oscillator
 from bayes_nlsid.structure.modal import ModalModel
 
@@ -18,7 +18,7 @@ X = oscillator(mass=1.0, frequency=F0, zeta=ZETA, location="x")
 SETTINGS = {"band": (10.0, 40.0), "noise": 0.01, "seconds": 10.0}
 
 
-def plan(linear: ModalModel, elements: list[Element], values: list[float], **changes: object) -> Plan:
+def plan(linear: ModalModel, elements: list[Element], values: list[float], **changes: object) -> MeasurementPlan:
     given = {"sensors": ("x",), "inputs": ("x",), "levels": (1.0,), **SETTINGS, **changes}
     return plan_test(linear, elements, values, **given)  # type: ignore[arg-type]
 

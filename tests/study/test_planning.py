@@ -46,6 +46,7 @@ def test_a_plan_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert cli.main(["check", str(study)]) == 0
     assert cli.main(["plan", str(study), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
+    assert "plan: 4 excitations, 2 sensors, 1 suspected joints" in said and "nothing to run yet" in said
     assert "with 5 N rms" in said and "0.05 N" in said and "f_s" in said
     plan = json.loads((tmp_path / "out" / "plan.json").read_text())
     gains = [e["gain_nats"] for e in plan["excitations"]]

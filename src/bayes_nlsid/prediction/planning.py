@@ -59,7 +59,7 @@ class Excitation:
 
 @final
 @dataclass(frozen=True)
-class Plan:
+class MeasurementPlan:
     """What tests can teach.
 
     Parameters
@@ -138,7 +138,7 @@ class Plan:
 
 def plan_test(linear: ModalModel, elements: Sequence[Element], values: Sequence[float], *, sensors: Sequence[str], inputs: Sequence[str],
               band: tuple[float, float], levels: Sequence[float], noise: float, seconds: float, quantity: str = "acceleration",
-              seed: int = 0, progress: Callable[[float, str], None] | None = None) -> Plan:
+              seed: int = 0, progress: Callable[[float, str], None] | None = None) -> MeasurementPlan:
     """The Fisher information of every sensor under every excitation.
 
     Parameters
@@ -187,7 +187,8 @@ def plan_test(linear: ModalModel, elements: Sequence[Element], values: Sequence[
                                  seconds * (band[1] - band[0]) / noise**2))
     prior = np.concatenate([np.full(len(near), FREQUENCY_PRIOR), np.full(len(near), DAMPING_PRIOR),
                             np.full(model.size - 2 * len(near), DECADE)])
-    return Plan(model.names, tuple(p.unit for p in model.parameters), theta, 2 * len(near), tuple(sensors), places, prior, tuple(found))
+    return MeasurementPlan(model.names, tuple(p.unit for p in model.parameters), theta, 2 * len(near), tuple(sensors), places, prior,
+                           tuple(found))
 
 
 @final

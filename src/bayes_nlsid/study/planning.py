@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.prediction.planning import DECADE, LEARNED, ROUGHLY, Plan, plan_test
+from bayes_nlsid.prediction.planning import DECADE, LEARNED, ROUGHLY, MeasurementPlan, plan_test
 from bayes_nlsid.study import report_page as html
 from bayes_nlsid.study.axes import brief_names, engineering
 from bayes_nlsid.study.building import build_element, build_structure, library, reduce_structure
@@ -63,7 +63,7 @@ def run_plan(study: Study, out: Path, *, seed: int | None = None, progress: Call
     return said
 
 
-def _compute(study: Study, entry: PlanEntry, seed: int, progress: Callable[[float, str], None] | None) -> Plan:
+def _compute(study: Study, entry: PlanEntry, seed: int, progress: Callable[[float, str], None] | None) -> MeasurementPlan:
     linear = reduce_structure(build_structure(study.structure), study.reduction)
     stated = study.linear.damping[:linear.modes]
     if stated:
@@ -78,7 +78,7 @@ def _compute(study: Study, entry: PlanEntry, seed: int, progress: Callable[[floa
         raise InputError(f"{study.file.name}: [plan]", str(error), "correct these entries") from None
 
 
-def record(found: Plan, title: str, seed: int) -> dict[str, Any]:
+def record(found: MeasurementPlan, title: str, seed: int) -> dict[str, Any]:
     """The plan as plain values: excitations ranked, sensors for the best of them, what stays unknown."""
     ranked = found.ranked()
     good = [row for row in ranked if row[0].status == "ok"]
@@ -127,7 +127,7 @@ def sentences(said: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _pictures(found: Plan, said: Mapping[str, Any]) -> dict[str, tuple[bytes, str]]:
+def _pictures(found: MeasurementPlan, said: Mapping[str, Any]) -> dict[str, tuple[bytes, str]]:
     from bayes_nlsid.study import figures_planning as draw
     from bayes_nlsid.study.figures import png
 

@@ -119,6 +119,11 @@ def plan(study: Study, recordings: Sequence[Mapping[str, Any]]) -> str:
         p = study.prediction
         parts.append(f"prediction: backbone of mode {p.mode} at {p.at} from {engineering(p.amplitude, 'm')}, {p.samples} samples; "
                      f"held out: {', '.join(p.heldout) or 'none'}")
+    if study.plan is not None:
+        count = len(study.plan.inputs) * len(study.plan.levels)
+        parts.append(f"plan: {count} excitations, {len(study.plan.sensors)} sensors, {len(study.plan.joints)} suspected joints (nlsid plan)")
+        if not study.recordings:
+            return "\n".join([*parts, "missing: no [[recordings]], so there is nothing to run yet"])
     missing = [text for given, text in (
         (study.linear.recording or study.linear.file, "no low-level recording under [linear]: the linear model is used as stated"),
         (study.identification, "no [identification]: only the linear model is made"),
