@@ -166,8 +166,9 @@ def _page(said: Mapping[str, Any], pictures: Mapping[str, tuple[bytes, str]], en
     body += ["<section><h2>Excitations, the best first</h2>",
              html.table(["at", "rms (N)", "information (nats)", "largest motion of the joints", ""], rows, "plan.json, excitations",
                         numeric=(1, 2)), "</section>"]
-    facts = [f"Multisine from {entry.band[0]:g} to {entry.band[1]:g} Hz, records of {entry.seconds:g} s, noise {entry.noise:.3g} (SI, rms in "
-             f"the band) of every {entry.quantity} sensor.", "Local to the assumed values: if they are far off, plan again with better ones.",
+    facts = [f"Multisine from {entry.band[0]:g} to {entry.band[1]:g} Hz, records of {entry.seconds:g} s, noise {entry.noise:.3g} (SI, rms "
+             f"in the band) of every {entry.quantity} sensor.",
+             "Local to the assumed values: if they are far off, plan again with better ones.",
              "Joint parameters were given a prior of one decade, frequencies 5 %, damping 50 %."]
     body += ["<section><h2>What this rests on</h2>", html.listing(facts),
              html.table(["input file", "SHA-256"], [[n, h] for n, h in inputs.items()], "the study file", hashes=(1,)), "</section>"]

@@ -121,7 +121,8 @@ def plan(study: Study, recordings: Sequence[Mapping[str, Any]]) -> str:
                      f"held out: {', '.join(p.heldout) or 'none'}")
     if study.plan is not None:
         count = len(study.plan.inputs) * len(study.plan.levels)
-        parts.append(f"plan: {count} excitations, {len(study.plan.sensors)} sensors, {len(study.plan.joints)} suspected joints (nlsid plan)")
+        parts.append(f"plan: {count} excitations, {len(study.plan.sensors)} sensors, {len(study.plan.joints)} suspected joints "
+                     "(nlsid plan)")
         if not study.recordings:
             return "\n".join([*parts, "missing: no [[recordings]], so there is nothing to run yet"])
     missing = [text for given, text in (
