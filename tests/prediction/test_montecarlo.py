@@ -92,6 +92,27 @@ def test_two_processes_give_the_same_as_one(monkeypatch: pytest.MonkeyPatch) -> 
     assert same(backbones(beam("iwan4_memory"), theta, decay), backbones(beam("iwan4_memory"), theta, decay, workers=2))
 
 
+def test_one_sample_that_hardly_decays_does_not_hold_up_the_others() -> None:
+    model = oscillator("cubic", zeta=0.01, free=True)
+    theta = np.tile([10.0, 0.02, 1e4], (9, 1))
+    theta[4, 1] = 1e-9
+    found = backbones(model, theta, Decay("x", 0.1, amplitudes=(0.02, 0.06), fs=400.0), path="time")
+    assert np.isfinite(np.delete(found.frequency, 4, axis=0)).all() and np.isnan(found.frequency[4, 0])
+
+
+def test_what_cannot_be_asked_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="mode 1 does not exist"):
+        backbones(CUBIC, np.array([[1e4]]), Decay("x", 0.1, mode=1))
+    monkeypatch.setattr(montecarlo, "MOST_BYTES", 16)
+    with pytest.raises(ValueError, match="backbones at 3 amplitudes are"):
+        backbones(CUBIC, np.array([[1e4], [2e4]]), DECAY)
+
+
+def test_forces_that_outdo_the_linear_spring_are_refused_quietly() -> None:
+    found = backbones(CUBIC, np.array([[-1e6], [1e4]]), DECAY, path="fast")
+    assert found.status.tolist()[1] == "ok" and found.status[0] != "ok" and np.isnan(found.frequency[0]).all()
+
+
 def test_an_undamped_mode_needs_no_duration_on_the_fast_path() -> None:
     found = backbones(oscillator("v|v|", zeta=0.0), [[0.2]] @ np.eye(1), Decay("x", 0.05, amplitudes=(0.01, 0.04)))
     assert found.damping[0] == pytest.approx(4 * 0.2 * found.amplitude / (3 * np.pi), rel=1e-2)

@@ -90,6 +90,7 @@ def test_samples_of_a_posterior(small: Path, tmp_path: Path, monkeypatch: pytest
     ('scatter = "1 %"', 'scatter = "-1 %"', ["scatter", "not positive"]),
     ('scatter = "1 %"\n', 'scatters = "1 %"\n', ["scatters", "did you mean 'scatter'"]),
     ("samples = 100", "samples = 3", ["samples", "out of range"]),
+    ("samples = 100", "samples = 100000000", ["samples", "out of range"]),
     ("samples = 100", 'path = "quick"', ["path", "'quick' is not possible"]),
     ('at = "x"\namp', 'at = "y"\namp', ["[montecarlo] at", "'y' is not a location"]),
     ("upper = 20.02", "", ["[[montecarlo.parameters]] 1 upper", "is missing"]),

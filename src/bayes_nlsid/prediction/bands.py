@@ -22,6 +22,8 @@ STEPS_PER_CYCLE = 100
 STORED_PER_CYCLE = 40
 REFERENCE_FACTOR = 4
 CHUNK_BYTES = 2**28
+SLOWEST = 10.0
+"""Samples whose linear part decays more slowly than the median by this factor are not waited for: low amplitudes stay without a value."""
 ENOUGH = 0.9
 """Share of the usable samples that must pass an amplitude for quantiles to be given there."""
 
@@ -235,8 +237,9 @@ def release_of(theta: Array, model: Model, at: str, amplitude: float, mode: int,
     frequency = float(np.median(omega[:, mode])) / (2 * np.pi)
     rate = fs if fs is not None else 2.0 ** np.ceil(np.log2(STEPS_PER_CYCLE * frequency))
     if duration is None:
-        slowest = float((omega[:, mode] * zeta[:, mode]).min())
-        if slowest <= 0:
+        rates = omega[:, mode] * zeta[:, mode]
+        slowest = max(float(rates.min()), float(np.median(rates)) / SLOWEST)
+        if rates.min() <= 0:
             raise ValueError("mode without linear damping: say how long to integrate (duration, s)")
         duration = 1.05 * float(np.log(amplitude / floor)) / slowest + 20 / frequency
     every = max(1, int(rate // max(STORED_PER_CYCLE * frequency, 2.2 * float(model.linear.frequency.max()))))

@@ -120,7 +120,7 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     omega, zeta = model.linear_values(theta)
     motion, square, converged, force = _balance(model, theta, omega, zeta, mode, np.exp(log_a))
     h2 = HARMONICS**2
-    w = np.sqrt(square)
+    w = np.sqrt(np.where(square > 0, square, np.nan))
     kinetic = np.einsum("mskh,h->msk", np.abs(motion) ** 2, h2)
     action = 0.5 * w * kinetic.sum(axis=0)
     linear = 2 * np.pi * w * np.einsum("sm,msk->sk", zeta * omega, kinetic)

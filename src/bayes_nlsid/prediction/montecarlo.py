@@ -26,6 +26,8 @@ from bayes_nlsid.simulation.schemes import SchemeName, spectrum, steps
 Array = NDArray[np.float64]
 PathName = Literal["auto", "fast", "time"]
 FAST_CHUNK, TIME_CHUNK = 250, 50
+MOST_BYTES = 2**33
+"""Of all curves together, which stand in memory at the end."""
 
 
 @final
@@ -119,6 +121,9 @@ def backbones(model: Model, theta: Array, decay: Decay, *, path: PathName = "aut
         raise ValueError(f"path must be auto, fast or time, got {path!r}")
     release = release_of(theta, model, decay.at, decay.start_amplitude, decay.mode, decay.amplitudes or None, None, decay.fs,
                          _duration(model, theta, decay))
+    if 16 * len(theta) * len(release.grid) > MOST_BYTES:
+        raise ValueError(f"{len(theta)} backbones at {len(release.grid)} amplitudes are {16e-9 * len(theta) * len(release.grid):.3g} GB; ask "
+                         "for fewer samples or amplitudes, or for no indices")
     quick = path == "fast" or (path == "auto" and _averages(model, theta, decay, release.grid))
     size = FAST_CHUNK if quick else TIME_CHUNK
     starts = list(range(0, len(theta), size))
@@ -163,6 +168,8 @@ def _duration(model: Model, theta: Array, decay: Decay) -> float | None:
     """The duration given; a placeholder where it is not needed because there is no linear damping to tell it (averaging)."""
     if decay.duration is not None:
         return decay.duration
+    if not 0 <= decay.mode < model.linear.modes:
+        return None  # which is refused where the release is made
     omega, zeta = model.linear_values(theta)
     return 400 / float(model.linear.frequency[decay.mode]) if (omega * zeta)[:, decay.mode].min() <= 0 else None
 

@@ -39,6 +39,9 @@ def montecarlo(context: Context) -> Result:
     entry = context.study.montecarlo
     assert entry is not None
     model, theta = stored_model(context)
+    if entry.mode > model.linear.modes:
+        raise InputError(f"{context.study.file.name}: [montecarlo] mode", f"{entry.mode} does not exist",
+                         f"write one from 1 to {model.linear.modes}")
     spreads = [] if entry.source == "posterior" else distributions(context.study.file.name, model, theta, entry.spreads)
     try:
         if entry.source == "posterior":
@@ -50,7 +53,7 @@ def montecarlo(context: Context) -> Result:
                           workers=context.workers, progress=lambda share, sentence: context.progress(0.9 * share, sentence))
     except ValueError as problem:
         raise InputError(f"{context.study.file.name}: [montecarlo]", str(problem),
-                         "change at, amplitude, mode, path or the parameters") from None
+                         "change at, amplitude, amplitudes, mode, path, samples or the parameters") from None
     context.progress(0.92, "the error of the computation itself")
     error = numerical_error(model, plan.theta[:plan.samples], _part(found, plan.samples), decay)
     context.progress(0.95, "sensitivities")
