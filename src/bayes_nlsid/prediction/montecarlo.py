@@ -121,21 +121,22 @@ def backbones(model: Model, theta: Array, decay: Decay, *, path: PathName = "aut
         raise ValueError(f"path must be auto, fast or time, got {path!r}")
     release = release_of(theta, model, decay.at, decay.start_amplitude, decay.mode, decay.amplitudes or None, None, decay.fs,
                          _duration(model, theta, decay))
-    if 16 * len(theta) * len(release.grid) > MOST_BYTES:
-        raise ValueError(f"{len(theta)} backbones at {len(release.grid)} amplitudes are {16e-9 * len(theta) * len(release.grid):.3g} GB; ask "
-                         "for fewer samples or amplitudes, or for no indices")
+    size = 16 * len(theta) * len(release.grid)
+    if size > MOST_BYTES:
+        raise ValueError(f"{len(theta)} backbones at {len(release.grid)} amplitudes are {1e-9 * size:.3g} GB; ask for fewer samples or "
+                         "amplitudes, or for no indices")
     quick = path == "fast" or (path == "auto" and _averages(model, theta, decay, release.grid))
-    size = FAST_CHUNK if quick else TIME_CHUNK
-    starts = list(range(0, len(theta), size))
-    kept = {i: found for i in range(len(starts)) if (found := _read(folder, i, min(size, len(theta) - starts[i]))) is not None}
+    step = FAST_CHUNK if quick else TIME_CHUNK
+    starts = list(range(0, len(theta), step))
+    kept = {i: found for i in range(len(starts)) if (found := _read(folder, i, min(step, len(theta) - starts[i]))) is not None}
     todo = [i for i in range(len(starts)) if i not in kept]
     shared = (model, decay, release, quick, path)
-    for number, answer in run_tasks(_chunk, shared, [theta[starts[i]:starts[i] + size] for i in todo], executor=executor, workers=workers):
+    for number, answer in run_tasks(_chunk, shared, [theta[starts[i]:starts[i] + step] for i in todo], executor=executor, workers=workers):
         kept[todo[number]] = answer
         if folder is not None:
             write_npz(_name(folder, todo[number]), **answer)
         if progress is not None:
-            progress(len(kept) / len(starts), f"backbones of {min(size * len(kept), len(theta))} of {len(theta)} samples")
+            progress(len(kept) / len(starts), f"backbones of {min(step * len(kept), len(theta))} of {len(theta)} samples")
     whole = {name: np.concatenate([kept[i][name] for i in range(len(starts))]) for name in ("frequency", "damping", "status", "way")}
     return Backbones(release.grid, whole["frequency"], whole["damping"], whole["status"], whole["way"])
 

@@ -49,7 +49,8 @@ def read_montecarlo(table: Table | None, locations: Sequence[str], prediction: P
     amplitudes = table.numbers("amplitudes", "length", () if prediction is None or table.has("amplitude") else prediction.amplitudes)
     if list(amplitudes) != sorted(set(amplitudes)) or any(a <= 0 for a in amplitudes):
         raise table.wrong("amplitudes", f"{list(amplitudes)} are not positive and ascending", 'write amplitudes = ["0.1 mm", "1 mm"]')
-    entry = MonteCarloEntry(source, at, amplitude, mode, amplitudes, tuple(spreads), table.integer("samples", 1000, low=16, high=MOST_SAMPLES),
+    entry = MonteCarloEntry(source, at, amplitude, mode, amplitudes, tuple(spreads),
+                            table.integer("samples", 1000, low=16, high=MOST_SAMPLES),
                             table.flag("indices", True), table.text("path", "auto", ("auto", "fast", "time")))
     table.close()
     return entry

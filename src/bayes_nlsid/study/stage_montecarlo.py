@@ -53,7 +53,7 @@ def montecarlo(context: Context) -> Result:
                           workers=context.workers, progress=lambda share, sentence: context.progress(0.9 * share, sentence))
     except ValueError as problem:
         raise InputError(f"{context.study.file.name}: [montecarlo]", str(problem),
-                         "change at, amplitude, amplitudes, mode, path, samples or the parameters") from None
+                         "change at, amplitudes, path, samples or the parameters") from None
     context.progress(0.92, "the error of the computation itself")
     error = numerical_error(model, plan.theta[:plan.samples], _part(found, plan.samples), decay)
     context.progress(0.95, "sensitivities")
