@@ -75,6 +75,7 @@ def _parser() -> argparse.ArgumentParser:
         out=True).add_argument("study", metavar="STUDY.toml")
     report = add("report", "write report.html again from stored results", _report)
     report.add_argument("out", metavar="DIR")
+    report.add_argument("--format", choices=("html", "markdown"), default="html", help="markdown also writes report.md")
     add("terms", "the library of force laws as a table", _terms)
     add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses)
     new = add("new", "write a commented study to start from", _new)
@@ -189,11 +190,14 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from bayes_nlsid.study.run import rebuild_report
+    from bayes_nlsid.study.run import rebuild_report, write_markdown
 
-    rebuild_report(Path(options.out))
+    out = Path(options.out)
+    wrote = write_markdown(out) if options.format == "markdown" else None
+    if wrote is None:
+        rebuild_report(out)
     if not options.quiet:
-        print(f"wrote {Path(options.out) / 'report.html'}")
+        print(f"wrote {wrote or out / 'report.html'}")
     return DONE
 
 

@@ -63,7 +63,7 @@ def render(report: Report) -> str:
 
 
 def _figures(report: Report, section: str) -> str:
-    return "".join(html.picture(p.png, p.caption, f"{p.source}; figures/{p.name}.png", p.caption.split(":")[0])
+    return "".join(html.picture(p.png, p.caption, f"{p.source}; figures/{p.name}.png", p.caption.split(":")[0].split(" (")[0])
                    for p in report.pictures if p.section == section)
 
 

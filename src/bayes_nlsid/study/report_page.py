@@ -42,20 +42,32 @@ figcaption { color: var(--soft); font-size: .88rem; margin-top: .4rem; max-width
 code, pre { font-family: ui-monospace, Consolas, monospace; font-size: .85em; }
 pre { background: var(--tint); padding: .8rem; overflow-x: auto; border-radius: 6px; }
 details summary { cursor: pointer; color: var(--accent); overflow-wrap: anywhere; }
-p, li, figcaption { overflow-wrap: anywhere; }
+p, li, figcaption, h1, h2, nav { overflow-wrap: anywhere; }
 td.long { min-width: 13rem; }
 td.hash { font-family: ui-monospace, Consolas, monospace; font-size: .8em; word-break: break-all; }
 @media print {
+  :root { --ink: #1b1f24; --soft: #57606a; --line: #d8dee4; --page: #ffffff; --tint: #f3f6f9; --accent: #0072B2; --good: #007a56;
+          --bad: #b3480a; }
   body { font-size: 10.5pt; } main { max-width: none; padding: 0; } nav { display: none; }
-  figure, table, .story { break-inside: avoid; } h2 { break-after: avoid; } details > * { display: block; } figure img { min-width: 0; }
+  figure, tr, .story { break-inside: avoid; } h2, summary { break-after: avoid; }
+  details::details-content { content-visibility: visible; display: block; }
+  figure img { min-width: 0; filter: none; }
+  .scroll { overflow: visible; } table { font-size: 8pt; min-width: 0; max-width: 100%; }
+  th, td { padding-right: .5rem; } td.n, th.n { white-space: normal; } td.long { min-width: 0; }
+  th, td, pre { overflow-wrap: anywhere; } pre { white-space: pre-wrap; font-size: 7.5pt; }
 }
 """
+
+
+ALONE = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Told to the browser: it may load nothing but what stands in the page, and run no script."""
 
 
 def page(title: str, body: str) -> str:
     """A whole page without any outside resource."""
     return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, '
             f'initial-scale=1">'
+            f'<meta http-equiv="Content-Security-Policy" content="{ALONE}">'
             f'<meta name="color-scheme" content="light dark"><title>{escape(title)}</title><style>{STYLE}</style></head>\n'
             f"<body><main>\n{body}\n</main></body></html>\n")
 

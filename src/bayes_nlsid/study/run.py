@@ -13,6 +13,7 @@ from bayes_nlsid.study.archive import keep_study, stored_study, study_text
 from bayes_nlsid.study.context import Context, Result
 from bayes_nlsid.study.progress import Reporter
 from bayes_nlsid.study.report import Report, render
+from bayes_nlsid.study.report_markdown import markdown
 from bayes_nlsid.study.schema import EXTRAS, STAGES, Study
 from bayes_nlsid.study.store import Saved, Store, write_atomic, writing
 from bayes_nlsid.study.summary import summarise, to_text
@@ -175,3 +176,28 @@ def rebuild_report(out: Path | str) -> dict[str, Any]:
         done = {name: saved for name in study.stages if (saved := store.load(name)) is not None}
         done |= kept_extras(store, study, done)
         return finish(store, study, done, seed)
+
+
+def write_markdown(out: Path | str) -> Path:
+    """Write ``report.md`` beside the page: of a run, whose page is written anew first, of a diagnosis or of a plan.
+
+    Returns
+    -------
+    Path
+        What was written.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no results.
+    """
+    folder = Path(out)
+    pages = [p for p in (folder / "report.html", folder / "plan.html") if p.exists()]
+    ready = pages and not (folder / "stages").is_dir()
+    if not ready:
+        rebuild_report(folder)
+    page = pages[0] if ready else folder / "report.html"
+    target = page.with_suffix(".md")
+    with writing(folder):
+        write_atomic(target, markdown(page.read_text(encoding="utf-8")).encode())
+    return target
