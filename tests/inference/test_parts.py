@@ -108,7 +108,7 @@ def test_wrong_priors_are_refused():
 
 def two_ways(problem, theta, variance):
     """The quadratic form and the plain sum."""
-    gaussian = GaussianResidual(problem, variance, theta[0], frequency_blocks(problem)[0])
+    gaussian = GaussianResidual(problem, variance, frequency_blocks(problem)[0])
     information = np.array([s.information for s in problem.observed.spectra])[problem.record]
     direct = [float(np.sum(information * norm.logpdf(problem.residual(t), 0, np.sqrt(variance)))) for t in theta]
     return gaussian, np.array(direct) , -0.5 * np.sum((1 - information) * np.log(2 * np.pi * variance)) * 0

@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.identification.condensed import Regression
 from bayes_nlsid.identification.problem import Problem
 
 
@@ -21,21 +22,16 @@ class Elimination:
 
     Parameters
     ----------
-    problem : Problem
-    root : ndarray (N,)
-        Square roots of the weights.
+    regression : Regression
     """
 
-    problem: Problem
-    root: NDArray[np.float64] = field(repr=False)
+    regression: Regression
     q: NDArray[np.float64] = field(init=False, repr=False)
     r: NDArray[np.float64] = field(init=False, repr=False)
     norms: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        seen, modes = self.problem.observed, self.problem.model.free_modes
-        rows = [np.where(seen.equation == k, column, 0.0) for k in modes for column in (seen.velocity, seen.displacement)]
-        matrix = np.concatenate([np.array(rows).reshape(len(rows), seen.size), self.problem.columns]).T * self.root[:, None]
+        matrix = self.regression.columns
         norms = np.linalg.norm(matrix, axis=0)
         norms = np.where(norms > 0, norms, 1.0)
         q, r = np.linalg.qr(matrix / norms)
@@ -43,70 +39,105 @@ class Elimination:
             object.__setattr__(self, name, value)
 
     @property
+    def problem(self) -> Problem:
+        """Whose coefficients are eliminated."""
+        return self.regression.problem
+
+    @property
     def count(self) -> int:
         """Number L of unknowns."""
         return len(self.norms)
 
-    def solve(self, target: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Minimise ‖target + C x‖ within bounds.
+    def solve(self, target: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Minimise ‖target + C x‖ within bounds, for B targets at once.
 
         Parameters
         ----------
-        target : ndarray (N,)
+        target : ndarray (B, n)
             Weighted residual without the eliminated columns.
 
         Returns
         -------
-        x : ndarray (L,)
+        x : ndarray (B, L)
             In physical units: 2ζω and ω² mode by mode, then coefficients.
-        residual : ndarray (N,)
-        basis : ndarray (N, free)
-            Orthonormal basis of the columns that are not held by a bound, for projecting a Jacobian.
+        residual : ndarray (B, n)
+        held : ndarray (B, L) of bool
+            Coefficients that a bound holds.
         """
+        held = np.zeros((len(target), self.count), dtype=bool)
         if self.count == 0:
-            return np.zeros(0), target, self.q
-        right = -(self.q.T @ target)
-        scaled: NDArray[np.float64] = np.asarray(np.linalg.lstsq(self.r, right, rcond=1e-13)[0], dtype=np.float64)
+            return np.zeros((len(target), 0)), target, held
+        right = -(target @ self.q)
+        scaled = self._least(right)
         # One step of refinement against the true residual recovers the digits that a close cancellation costs.
-        scaled = scaled + np.linalg.lstsq(self.r, -(self.q.T @ (target + self.q @ (self.r @ scaled))), rcond=1e-13)[0]
+        scaled = scaled + self._least(-((target + (scaled @ self.r.T) @ self.q.T) @ self.q))
         lower, upper = self._box(scaled)
-        held = np.zeros(self.count, dtype=bool)
-        if not ((scaled >= lower) & (scaled <= upper)).all():
-            scaled, held = self._bounded(right, scaled)
-        residual = target + self.q @ (self.r @ scaled)
-        basis = self.q if not held.any() else self.q @ np.linalg.qr(self.r[:, ~held])[0]
-        return scaled / self.norms, residual, basis
+        for i in np.flatnonzero(((scaled < lower) | (scaled > upper)).any(axis=1)):
+            scaled[i], held[i] = self._bounded(right[i], scaled[i])
+        return scaled / self.norms, target + (scaled @ self.r.T) @ self.q.T, held
+
+    def _least(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.lstsq(self.r, right.T, rcond=1e-13)[0].T, dtype=np.float64)
+
+    def project(self, slope: NDArray[np.float64], held: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Part of slope (B, n, K) orthogonal to the columns that are not held (B, L)."""
+        inside = self.q.T @ slope
+        for i in np.flatnonzero(held.any(axis=1)):
+            basis = np.linalg.qr(self.r[:, ~held[i]])[0]
+            inside[i] = basis @ (basis.T @ inside[i])
+        return slope - self.q @ inside
 
     def _bounded(self, right: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        from scipy.optimize import lsq_linear
-
         for _ in range(3):   # the box of 2ζω depends on ω; ω moves by parts in a thousand, so this settles at once
             lower, upper = self._box(scaled)
-            scaled = np.clip(lsq_linear(self.r, right, (lower, upper), method="bvls").x, lower, upper)
+            scaled = np.clip(self._within(right, lower, upper), lower, upper)
             if not self.problem.model.free_modes:
                 break
         margin = 1e-10 * (upper - lower)
         return scaled, (scaled <= lower + margin) | (scaled >= upper - margin)
 
+    def _within(self, right: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minimise ‖R x − right‖ in a box: hold what leaves it, let go what pushes inwards; scipy where that does not settle."""
+        x = np.array(np.linalg.lstsq(self.r, right, rcond=1e-13)[0], dtype=np.float64)
+        held = np.zeros(self.count, dtype=bool)
+        for _ in range(2 * self.count + 5):
+            out = ~held & ((x < lower) | (x > upper))
+            if out.any():
+                x[out] = np.clip(x[out], lower[out], upper[out])
+                held |= out
+            else:
+                push = self.r.T @ (right - self.r @ x)    # downhill
+                inwards = held & np.where(x <= lower, push > 0, push < 0)
+                worst = int(np.argmax(np.where(inwards, np.abs(push), -1.0)))
+                if not inwards[worst] or np.abs(push[worst]) <= 1e-12 * np.linalg.norm(right):
+                    return x
+                held[worst] = False
+            free = ~held
+            x[free] = np.linalg.lstsq(self.r[:, free], right - self.r[:, held] @ x[held], rcond=1e-13)[0]
+        from scipy.optimize import lsq_linear
+
+        return np.asarray(lsq_linear(self.r, right, (lower, upper), method="bvls").x)
+
     def _box(self, scaled: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Bounds (..., L) of scaled coefficients (..., L)."""
         box = self.problem.bounds
         modes = len(self.problem.model.free_modes)
-        out = np.empty((self.count, 2))
-        for i in range(modes):
-            out[2 * i + 1] = (2 * np.pi * box[i]) ** 2
-            omega = np.sqrt(np.clip(scaled[2 * i + 1] / self.norms[2 * i + 1], *out[2 * i + 1]))
-            out[2 * i] = 2 * box[modes + i] * omega
-        out[2 * modes:] = box[list(self.problem.linear_index)].reshape(-1, 2)
+        out = np.empty((*scaled.shape, 2))
+        square = (2 * np.pi * box[:modes]) ** 2
+        omega = np.sqrt(np.clip(scaled[..., 1:2 * modes:2] / self.norms[1:2 * modes:2], square[:, 0], square[:, 1]))
+        out[..., 1:2 * modes:2, :] = square
+        out[..., 0:2 * modes:2, :] = 2 * box[modes:2 * modes] * omega[..., None]
+        out[..., 2 * modes:, :] = box[list(self.problem.linear_index)].reshape(-1, 2)
         out *= self.norms[:, None]
-        return out[:, 0], out[:, 1]
+        return out[..., 0], out[..., 1]
 
     def fill(self, theta: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Theta (P,) with the eliminated entries put in, clipped to the bounds against rounding."""
+        """Theta (B, P) with the eliminated entries (B, L) put in, clipped to the bounds against rounding."""
         out = theta.copy()
         modes = len(self.problem.model.free_modes)
-        omega = np.sqrt(x[1:2 * modes:2])
-        out[:modes], out[modes:2 * modes] = omega / (2 * np.pi), x[0:2 * modes:2] / (2 * omega)
-        out[list(self.problem.linear_index)] = x[2 * modes:]
+        omega = np.sqrt(np.maximum(x[:, 1:2 * modes:2], 1e-300))
+        out[:, :modes], out[:, modes:2 * modes] = omega / (2 * np.pi), x[:, 0:2 * modes:2] / (2 * omega)
+        out[:, list(self.problem.linear_index)] = x[:, 2 * modes:]
         return np.clip(out, self.problem.bounds[:, 0], self.problem.bounds[:, 1])
 
 

@@ -10,12 +10,15 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayes_nlsid.identification.descent import Descent, Point
-from bayes_nlsid.identification.elimination import jacobian
+from bayes_nlsid.identification.condensed import Condensed, Regression, regression, tabled
+from bayes_nlsid.identification.descent import Descent, Points
 from bayes_nlsid.identification.problem import Problem
 
 TABLE_TOLERANCE = 0.01   # share of the mean square that a force table may change before it is mentioned
 SCREENING, SURVIVORS = 7, 8    # iterations given to every start, starts that go on to convergence
+POLISHED, POLISHING = 1, 5     # points and iterations with the laws as they are, after a search with blurred jumps
+ENOUGH = 1e-3                  # gain of such an iteration, relative, at which it ends
+SIDE_BY_SIDE = 4_000_000       # numbers in the derivatives of the starts that are followed at once
 
 
 @final
@@ -92,7 +95,7 @@ class Fit:
 
 
 def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[np.float64] | None = None,
-        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 200) -> Fit:
+        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 200, shared: Condensed | None = None) -> Fit:
     """Fit all parameters of a problem.
 
     Parameters
@@ -109,6 +112,8 @@ def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[n
         random; otherwise every start takes the known ones and draws the rest.
     iterations : int
         Limit per start.
+    shared : Condensed or None
+        Columns of this and other problems under the same weights, condensed once for all (see ``condensed``).
 
     Returns
     -------
@@ -122,10 +127,17 @@ def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[n
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}")
     chosen = problem.default_weight if weights is None else np.asarray(weights, dtype=float)
-    descent = Descent(problem, chosen)
-    points = _run(descent, _first_points(descent, starts, seed, _known(problem, warm)), iterations)
-    tried = tuple(Start(p.theta, p.cost / problem.samples, p.status, p.evaluations, spent) for p, spent in points)
-    return _result(problem, chosen, tried, seed)
+    began = time.perf_counter()
+    rough = not tabled(problem) and tabled(problem, rough=True)
+    descent = Descent(regression(problem, chosen, shared, rough))
+    points = _run(descent, np.array(_first_points(descent, starts, seed, _known(problem, warm))), iterations)
+    if descent.regression.root is None and rough and _blurred(problem, chosen, points):
+        points = _polished(problem, chosen, points, iterations)
+    used = descent.regression
+    share = (time.perf_counter() - began) / len(points.cost)
+    tried = tuple(Start(points.theta[i], float(points.cost[i]) / problem.samples, str(points.status[i]), int(points.evaluations[i]), share)
+                  for i in range(len(points.cost)))
+    return _result(used, chosen, tried, seed)
 
 
 def _known(problem: Problem, warm: Mapping[str, float] | ArrayLike | None) -> NDArray[np.float64]:
@@ -153,39 +165,62 @@ def _first_points(descent: Descent, starts: int, seed: int, known: NDArray[np.fl
     return out
 
 
-def _run(descent: Descent, first: list[NDArray[np.float64]], iterations: int) -> list[tuple[Point, float]]:
-    """All starts through the screening, the best of them to the end."""
-    out: list[tuple[Point, float]] = []
-    for x in first:
-        began = time.perf_counter()
-        out.append((descent.advance(descent.at(x), min(SCREENING, iterations)), time.perf_counter() - began))
-    order = np.argsort([p.cost for p, _ in out], kind="stable")
-    for place, i in enumerate(order):
-        point, spent = out[i]
-        began = time.perf_counter()
-        if point.status == "running":
-            if place < SURVIVORS:
-                point = descent.advance(point, max(0, iterations - SCREENING))
-                point = point if point.status != "running" else replace(point, status="iteration limit")
-            else:
-                point = replace(point, status="dropped after screening")
-        out[i] = (point, spent + time.perf_counter() - began)
-    return out
+def _run(descent: Descent, first: NDArray[np.float64], iterations: int) -> Points:
+    """All starts through the screening, the best of them to the end; as many side by side as fit into memory."""
+    side = max(1, int(SIDE_BY_SIDE // (descent.regression.size * (1 + len(descent.free)))))
+    parts = [descent.advance(descent.at(first[i:i + side]), min(SCREENING, iterations)) for i in range(0, len(first), side)]
+    points = parts[0]
+    for part in parts[1:]:
+        points = points.joined(part)
+    order = np.argsort(points.cost, kind="stable")
+    running = order[points.status[order] == "running"]
+    ahead = np.array([i for i in order[:SURVIVORS] if points.status[i] == "running"], dtype=np.intp)
+    for i in range(0, len(ahead), side):
+        chosen = ahead[i:i + side]
+        points = points.put(chosen, descent.advance(points.take(chosen), max(0, iterations - SCREENING)))
+    status = points.status.copy()
+    left = np.setdiff1d(running, ahead)
+    status[left] = "dropped after screening"
+    status[ahead] = np.where(status[ahead] == "running", "iteration limit", status[ahead])
+    return replace(points, status=status)
 
 
-def _result(problem: Problem, weights: NDArray[np.float64], tried: tuple[Start, ...], seed: int) -> Fit:
+def _blurred(problem: Problem, weights: NDArray[np.float64], points: Points) -> bool:
+    """Whether blurring the jumps of laws has changed the best mean square so far that it matters."""
+    best = int(np.argmin(points.cost))
+    if not np.isfinite(points.cost[best]):
+        return False
+    exact = float(np.sum(weights * problem.residual(points.theta[best]) ** 2))
+    return abs(exact - points.cost[best]) > TABLE_TOLERANCE * exact
+
+
+def _polished(problem: Problem, weights: NDArray[np.float64], points: Points, iterations: int) -> Points:
+    """The best points that blurred jumps led to, brought down once more on the laws as they are; all others only began the search."""
+    exact = Descent(regression(problem, weights))
+    best = np.argsort(points.cost, kind="stable")[:POLISHED]
+    fine = exact.advance(exact.at(points.x[best]), min(iterations, POLISHING), ENOUGH)
+    status = np.where(fine.status == "running", "converged" if POLISHING < iterations else "iteration limit", fine.status)
+    others = np.setdiff1d(np.arange(len(points.cost)), best)
+    begun = points.take(others)
+    begun = replace(begun, cost=np.full(len(others), np.inf), status=np.full(len(others), "dropped after screening", dtype="<U32"))
+    empty = np.zeros((len(others), exact.regression.size if len(fine.cost) else 0))
+    return replace(fine, status=status).joined(replace(begun, residual=empty)) if len(others) else replace(fine, status=status)
+
+
+def _result(used: Regression, weights: NDArray[np.float64], tried: tuple[Start, ...], seed: int) -> Fit:
+    problem = used.problem
     best = min(tried, key=lambda x: x.mse)
     size = len(problem.names)
     if not np.isfinite(best.mse):
         nothing = np.full(size, np.nan)
         reason = f"none of {len(tried)} starts could be evaluated: {sorted({x.status for x in tried})}"
         return Fit(nothing, nothing, np.inf, np.full((size, size), np.nan), 0, tried, "failed", (reason,), problem, weights, seed)
-    covariance, rank = covariance_at(problem, best.theta, weights, best.mse)
+    covariance, rank = covariance_at(used, best.theta, weights, best.mse)
     reasons = []
     if rank < size:
         reasons.append(f"the recordings inform {rank} of {size} directions; the others keep the width of their bounds")
-    if problem.places:
-        exact = replace(problem, places=0).mse(best.theta, weights)
+    if problem.places and tabled(problem) and problem.pieces:
+        exact = float(np.sum(weights * problem.exact_residual(best.theta) ** 2) / problem.samples)
         if abs(exact - best.mse) > TABLE_TOLERANCE * exact:
             reasons.append(f"interpolating the force laws between {problem.places} displacements changes the mean square from {exact:.3g} "
                            f"to {best.mse:.3g}")
@@ -195,15 +230,16 @@ def _result(problem: Problem, weights: NDArray[np.float64], tried: tuple[Start, 
     return Fit(best.theta, problem.to_s(best.theta), best.mse, covariance, rank, tried, status, tuple(reasons), problem, weights, seed)
 
 
-def covariance_at(problem: Problem, theta: NDArray[np.float64], weights: NDArray[np.float64],
+def covariance_at(used: Regression, theta: NDArray[np.float64], weights: NDArray[np.float64],
                   mse: float) -> tuple[NDArray[np.float64], int]:
     """Covariance (P, P) in s and the number of informed directions, see ``Fit.covariance``."""
+    problem = used.problem
     size = len(problem.names)
     if size == 0:
         return np.zeros((0, 0)), 0
     low, high = problem.to_s(problem.bounds.T)
     width = (high - low) / np.sqrt(12.0)      # standard deviation of a uniform density over the box
-    slope = jacobian(problem, theta) * (np.sqrt(weights)[:, None] * width)
+    slope = used.slope(theta) * width
     slope = np.where(np.isfinite(slope), slope, 0.0)
     # Mean square of one weighted entry, with the degrees of freedom of the fit taken off; noise-free data are not trusted beyond rounding.
     variance = max(mse, problem.rounding(weights), 1e-300) * problem.samples / max(1, problem.size - size)

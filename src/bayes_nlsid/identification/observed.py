@@ -9,13 +9,15 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import Motion, force_along, motion
-from bayes_nlsid.forces.term import Term
+from bayes_nlsid.forces.term import Memory, Term
 from bayes_nlsid.identification.scenario import Scenario
 from bayes_nlsid.identification.spectrum import Spectrum
-from bayes_nlsid.identification.table import ForceTable, Symmetry, build, symmetry_of
+from bayes_nlsid.identification.table import ForceTable, Kind, Symmetry, build, kind_of
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 
+SPRING = LIBRARY["spring"]
 BLOCK = 2_000_000  # samples of force held at once, about 16 MB per array
 
 
@@ -31,6 +33,18 @@ class Cell:
     equation: int
     entries: slice
     bins: int
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """Which table: of which locations, how many places, in displacement or in velocity."""
+
+    locations: tuple[str, ...]
+    memory: Memory
+    symmetry: Symmetry
+    places: int
+    rate: bool
 
 
 @final
@@ -70,8 +84,11 @@ class Observed:
     record: NDArray[np.intp] = field(init=False, repr=False)
     linear_force: NDArray[np.float64] = field(init=False, repr=False)
     _motions: dict[tuple[int, str, bool], Motion] = field(init=False, repr=False, default_factory=dict)
-    _kinds: dict[tuple[str, str], Symmetry | None] = field(init=False, repr=False, default_factory=dict)
-    _tables: dict[tuple[tuple[str, ...], str, str, int], ForceTable] = field(init=False, repr=False, default_factory=dict)
+    _kinds: dict[tuple[str, str, bool], Kind | None] = field(init=False, repr=False, default_factory=dict)
+    _columns: dict[tuple[int, str, str, str, bool], NDArray[np.float64]] = field(init=False, repr=False, default_factory=dict)
+    _linear_parts: dict[tuple[int, ...], NDArray[np.float64]] = field(init=False, repr=False, default_factory=dict)
+    _peaks: dict[str, tuple[float, float]] = field(init=False, repr=False, default_factory=dict)
+    _tables: dict[Part, tuple[tuple[ForceTable, ...], ...]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.data:
@@ -137,6 +154,14 @@ class Observed:
         """Number n of samples per equation, over all recordings."""
         return sum(s.count for s in self.spectra)
 
+    def linear_part(self, free_modes: tuple[int, ...]) -> NDArray[np.float64]:
+        """(N,) a − φᵀF, with damping and stiffness of the modes that are not free."""
+        if free_modes not in self._linear_parts:
+            omega, zeta = self.linear.omega[self.equation], self.linear.zeta[self.equation]
+            known = ~np.isin(self.equation, free_modes)
+            self._linear_parts[free_modes] = self.inertia + known * (2 * zeta * omega * self.velocity + omega**2 * self.displacement)
+        return self._linear_parts[free_modes]
+
     def leverage(self, location: str) -> NDArray[np.float64]:
         """Row b (len(equations),) of a location in the fitted equations."""
         return self.linear.rows((location,))[0, list(self.scenario.equations)]
@@ -153,11 +178,13 @@ class Observed:
 
     def peak(self, location: str) -> tuple[float, float]:
         """Largest |q| (m) and |v| (m/s) of a location over the fitted samples of all recordings."""
-        q, v = 0.0, 0.0
-        for r, spectrum in enumerate(self.spectra):
-            path = self.path(r, location)
-            q, v = max(q, float(np.max(np.abs(path[0][spectrum.samples])))), max(v, float(np.max(np.abs(path[1][spectrum.samples]))))
-        return q, v
+        if location not in self._peaks:
+            q, v = 0.0, 0.0
+            for r, spectrum in enumerate(self.spectra):
+                path = self.path(r, location)
+                q, v = max(q, float(np.max(np.abs(path[0][spectrum.samples])))), max(v, float(np.max(np.abs(path[1][spectrum.samples]))))
+            self._peaks[location] = q, v
+        return self._peaks[location]
 
     def force_samples(self, term: Term, record: int, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:
         """Force (..., count), N, of a term along the recorded motion, at the samples that are fitted."""
@@ -178,38 +205,93 @@ class Observed:
 
         With ``places`` the law is interpolated between so many displacements where it allows that (see ``table``); 0 is exact.
         """
-        def exact(law: Term, values: ArrayLike, spring_off: bool) -> NDArray[np.float64]:
-            return np.asarray(sum(self._exact_force(law, name, values, spring_off) for name in locations))
+        parts = self.parts(term, locations, places)
+        if not parts:
+            return np.asarray(sum(self._exact_force(term, name, p, excess) for name in locations))
+        values = np.asarray(p, dtype=float)
+        out = np.zeros((*values.shape[:-1], self.size))
+        for part in parts:
+            for name, tables in zip(part.locations, self.tables(part), strict=True):
+                for record, table in enumerate(tables):
+                    self._spread(name, record, table.force(term, values), out)
+        if excess and term.stiffness is not None:
+            stiffness = np.asarray(term.stiffness(*np.moveaxis(values, -1, 0)), dtype=float)
+            out -= stiffness[..., None] * self.stuck(locations)
+        return out
 
-        kind = self._kind(term) if places else None
+    def parts(self, term: Term, locations: Sequence[str], places: int, rough: bool = False) -> tuple[Part, ...]:
+        """Tables that hold the force of a term at locations with common parameters; none if it must be evaluated along the recordings.
+
+        ``rough``: jumps may be blurred.
+        """
+        kind = self._kind(term, rough) if places else None
         if kind is None:
-            return exact(term, p, excess)
-        key = (tuple(locations), term.memory, kind, places)
-        if key not in self._tables:
-            # Memory runs through all samples, also those that are not fitted.
-            reach = max(float(np.max(np.abs(self.path(r, name)[0]))) for r in range(len(self.data)) for name in locations)
-            self._tables[key] = build(lambda t, x: exact(t, x, False), term.memory, kind, reach, places)
-        return self._tables[key].force(term, p, excess)
+            return ()
+        group = tuple(locations)
+        if kind == "sum":
+            return Part(group, "none", "odd", places, False), Part(group, "none", "odd", places, True)
+        return (Part(group, term.memory, kind, places, False),)
 
-    def _kind(self, term: Term) -> Symmetry | None:
+    def tables(self, part: Part) -> tuple[tuple[ForceTable, ...], ...]:
+        """One table for each location and recording, worked out when first asked for."""
+        if part not in self._tables:
+            # Memory runs through all samples, also those that are not fitted.
+            column = 1 if part.rate else 0
+            reach = max(float(np.max(np.abs(self.path(r, name)[column]))) for r in range(len(self.data)) for name in part.locations)
+
+            def table(record: int, name: str) -> ForceTable:
+                return build(lambda law, x: self._transform_of(law, record, name, x, False), part.memory, part.symmetry, reach, part.places,
+                             part.rate)
+
+            self._tables[part] = tuple(tuple(table(r, name) for r in range(len(self.data))) for name in part.locations)
+        return self._tables[part]
+
+    def column(self, term: Term, locations: Sequence[str], excess: bool) -> NDArray[np.float64]:
+        """Contribution (N,) of a term that is linear in its coefficient, per unit of it; each location is walked through once."""
+        out = np.zeros(self.size)
+        for name in locations:
+            for record in range(len(self.data)):
+                self._spread(name, record, self.transformed(term, name, excess, record), out)
+        return out
+
+    def transformed(self, term: Term, location: str, excess: bool, record: int) -> NDArray[np.float64]:
+        """In-band transform (2 bins,) of the force of such a term itself along one recording."""
+        key = (record, location, term.name, term.formula, excess)
+        if key not in self._columns:
+            self._columns[key] = self._transform_of(term, record, location, np.ones((1, 1)), excess)[0]
+        return self._columns[key]
+
+    def stuck(self, locations: Sequence[str]) -> NDArray[np.float64]:
+        """Contribution (N,) of a spring of 1 N/m at each of the locations."""
+        return self.column(SPRING, locations, False)
+
+    def _spread(self, location: str, record: int, part: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Add the in-band force (..., 2 bins) at a location along one recording to every equation (..., N)."""
+        lever = dict(zip(self.scenario.equations, self.leverage(location), strict=True))
+        for cell in self.cells:
+            if cell.record == record and lever[cell.equation] != 0.0:
+                out[..., cell.entries] += lever[cell.equation] * part
+
+    def _kind(self, term: Term, rough: bool) -> Kind | None:
         """What table the law allows, found out once for each law: it takes thousands of evaluations of it."""
-        key = (term.name, term.formula)
+        key = (term.name, term.formula, rough)
         if key not in self._kinds:
-            self._kinds[key] = symmetry_of(term, 1.0)
+            self._kinds[key] = kind_of(term, 1.0, rough)
         return self._kinds[key]
+
+    def _transform_of(self, term: Term, record: int, location: str, rows: NDArray[np.float64], excess: bool) -> NDArray[np.float64]:
+        """In-band transform (B, 2 bins) of the force itself along one recording, of parameters (B, n_p)."""
+        step = max(1, BLOCK // self.data[record].n)
+        parts = [self.spectra[record].apply(self.force_samples(term, record, location, rows[i:i + step], excess))
+                 for i in range(0, len(rows), step)]
+        return np.concatenate(parts)
 
     def _exact_force(self, term: Term, location: str, p: ArrayLike, excess: bool) -> NDArray[np.float64]:
         values = np.asarray(p, dtype=float)
         rows = values.reshape(-1, values.shape[-1])
         out = np.zeros((len(rows), self.size))
-        lever = dict(zip(self.scenario.equations, self.leverage(location), strict=True))
-        for r, spectrum in enumerate(self.spectra):
-            step = max(1, BLOCK // self.data[r].n)
-            for i in range(0, len(rows), step):
-                part = spectrum.apply(self.force_samples(term, r, location, rows[i:i + step], excess))
-                for cell in self.cells:
-                    if cell.record == r and lever[cell.equation] != 0.0:
-                        out[i:i + step, cell.entries] = lever[cell.equation] * part
+        for record in range(len(self.data)):
+            self._spread(location, record, self._transform_of(term, record, location, rows, excess), out)
         return out.reshape(*values.shape[:-1], self.size)
 
     def noise_variance(self, least: float = 0.0) -> NDArray[np.float64]:

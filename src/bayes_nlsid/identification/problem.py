@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -89,10 +90,10 @@ class Problem:
     observed: Observed = field(default=None, repr=False)  # type: ignore[assignment]
     bounds: NDArray[np.float64] = field(init=False, repr=False)
     coordinates: Coordinates = field(init=False, repr=False)
-    base: NDArray[np.float64] = field(init=False, repr=False)
-    columns: NDArray[np.float64] = field(init=False, repr=False)
     linear_index: tuple[int, ...] = field(init=False, repr=False)
     pieces: tuple[Piece, ...] = field(init=False, repr=False)
+    _linear: tuple[Piece, ...] = field(init=False, repr=False)
+    _constant: tuple[Piece, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", tuple(self.data))
@@ -113,35 +114,51 @@ class Problem:
     def _split(self) -> None:
         """Sort the elements into constant parts, columns and pieces that need the force laws."""
         where = {(p.element, p.group, p.param.name): i for i, p in enumerate(self.model.parameters) if p.param is not None}
-        seen = self.observed
-        omega, zeta = self.model.linear.omega[seen.equation], self.model.linear.zeta[seen.equation]
-        free = np.isin(seen.equation, self.model.free_modes)
-        base = seen.inertia + np.where(free, 0.0, 2 * zeta * omega * seen.velocity + omega**2 * seen.displacement)
-        columns, index, pieces = [], [], []
-        if self.model.free_gain:   # the recorded force moves from the constant part to a column of its own
-            base = base + (force := self._force())
-            columns.append(-force)
+        linear, index, pieces, constant = [], [], [], []
+        if self.model.free_gain:
+            self._force()
             index.append(2 * len(self.model.free_modes))
         for e, element in enumerate(self.model.elements):
             known = dict(element.fixed)
             fixed = np.array([known.get(p.name, np.nan) for p in element.term.params])
             open_slots = tuple(int(i) for i in np.flatnonzero(np.isnan(fixed)))
-            for g, group in enumerate(element.groups):
-                piece = Piece(element, group, tuple(where[e, g, element.term.params[i].name] for i in open_slots), open_slots, fixed)
-                if element.term.linear and open_slots:
-                    columns.append(self._piece_force(replace(piece, fixed=np.ones(1)), np.ones(self.model.size)))
-                    index.append(piece.columns[0])
-                elif open_slots:
-                    pieces.append(piece)
-                else:
-                    base = base + self._piece_force(piece, np.zeros(self.model.size))
-            if element.term.linear and open_slots and element.excess and not np.any(columns[-len(element.groups):]):
-                raise ValueError(f"element {element.term.name!r}: excess=True leaves nothing of it at {element.locations}; use "
-                                 f"excess=False")
-        object.__setattr__(self, "base", base)
-        object.__setattr__(self, "columns", np.array(columns).reshape(len(columns), seen.size))
-        object.__setattr__(self, "linear_index", tuple(index))
-        object.__setattr__(self, "pieces", tuple(pieces))
+            own = [Piece(element, group, tuple(where[e, g, element.term.params[i].name] for i in open_slots), open_slots, fixed)
+                   for g, group in enumerate(element.groups)]
+            if element.term.linear and open_slots:
+                linear += own
+                index += [piece.columns[0] for piece in own]
+                if element.excess and not any(self._moves(piece) for piece in own):
+                    raise ValueError(f"element {element.term.name!r}: excess=True leaves nothing of it at {element.locations}; use "
+                                     f"excess=False")
+            elif open_slots:
+                pieces += own
+            else:
+                constant += own
+        for name, value in (("linear_index", tuple(index)), ("pieces", tuple(pieces)), ("_linear", tuple(linear)),
+                            ("_constant", tuple(constant))):
+            object.__setattr__(self, name, value)
+
+    def _moves(self, piece: Piece) -> bool:
+        """Whether anything is left of a linear term."""
+        seen, element = self.observed, piece.element
+        return any(np.any(seen.transformed(element.term, name, element.excess, record))
+                   for record in range(len(self.data)) for name in piece.locations)
+
+    @cached_property
+    def base(self) -> NDArray[np.float64]:
+        """(N,) what no parameter changes; with a free gain the recorded force stands in a column of its own instead."""
+        out = self.observed.linear_part(self.model.free_modes)
+        if self.model.free_gain:
+            out = out + self._force()
+        return np.asarray(sum((self._piece_force(piece, np.zeros(self.model.size)) for piece in self._constant), out))
+
+    @cached_property
+    def columns(self) -> NDArray[np.float64]:
+        """(L, N) of everything linear in a coefficient of its own, in the order of ``linear_index``."""
+        seen = self.observed
+        gain = [-self._force()] if self.model.free_gain else []
+        columns = [*gain, *(seen.column(x.element.term, x.locations, x.element.excess) for x in self._linear)]
+        return np.array(columns).reshape(len(columns), seen.size)
 
     def _force(self) -> NDArray[np.float64]:
         """In-band modal force (N,) as recorded.
@@ -170,6 +187,16 @@ class Problem:
         values = self._checked(theta)
         return sum((self._piece_force(piece, values) for piece in self.pieces), np.zeros((*values.shape[:-1], self.size)))
 
+    def exact_residual(self, theta: ArrayLike) -> NDArray[np.float64]:
+        """Residual (N,) of theta (P,) with every force law evaluated along the recordings, whatever ``places`` is."""
+        values = self._checked(theta)
+        out = self.residual(values)
+        for piece in self.pieces:
+            element, p = piece.element, piece.values(values)
+            if self.observed.parts(element.term, piece.locations, self.places):
+                out += self.observed.force(element.term, piece.locations, p, element.excess) - self._piece_force(piece, values)
+        return out
+
     def residual(self, theta: ArrayLike) -> NDArray[np.float64]:
         """Residual (..., N) of Eq. 13c, kg^1/2 m/s², of theta (..., P): in-band real DFT of every equation of every recording.
 
@@ -190,7 +217,14 @@ class Problem:
                     out[..., part] += (2 * zeta * omega)[..., k, None] * self.observed.velocity[part]
                     out[..., part] += (omega**2)[..., k, None] * self.observed.displacement[part]
         if self.linear_index:
-            out += values[..., list(self.linear_index)] @ self.columns
+            if values.ndim > 1 or "columns" in self.__dict__:
+                out += values[..., list(self.linear_index)] @ self.columns
+            else:   # one point: columns need not be laid out
+                coefficients = values[list(self.linear_index)]
+                if self.model.free_gain:
+                    out -= coefficients[0] * self._force()
+                for piece, c in zip(self._linear, coefficients[len(coefficients) - len(self._linear):], strict=True):
+                    out += c * self.observed.column(piece.element.term, piece.locations, piece.element.excess)
         return out
 
     def mse(self, theta: ArrayLike, weights: NDArray[np.float64] | None = None) -> NDArray[np.float64]:

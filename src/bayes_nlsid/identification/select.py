@@ -6,11 +6,13 @@ import time
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.identification.condensed import Condensed, condense, tabled
 from bayes_nlsid.identification.fit import Fit, fit
 from bayes_nlsid.identification.noise import smoothed_variance
 from bayes_nlsid.identification.problem import Problem
@@ -18,6 +20,7 @@ from bayes_nlsid.model import Element
 
 Progress = Callable[[float, str], None]
 ALPHA = 1e-3   # chance that noise alone adds a term in one round, all candidates together
+KEPT = 40_000_000   # numbers in the residuals that are kept within a round
 LEAST_GAIN = 0.05   # share of the mean square that a term of moderate significance must explain
 
 
@@ -102,6 +105,8 @@ class _Search:
     weights: NDArray[np.float64] | None
     workers: int
     progress: Progress | None
+    shared: Condensed | None = None
+    kept: dict[int, tuple[Fit, NDArray[np.float64]]] = field(default_factory=dict, repr=False)
 
     def attempt(self, elements: tuple[Element, ...], warm: dict[str, float], tag: str, starts: int) -> Fit | str:
         """Fit one set of elements, or say why it cannot be.
@@ -112,7 +117,7 @@ class _Search:
         try:
             problem = self.problem.with_elements(self.problem.model.elements + elements)
             known = all(problem.names[i] in warm for piece in problem.pieces for i in piece.columns)
-            return fit(problem, starts=1 if known else starts, seed=seed, weights=self.weights, warm=warm)
+            return fit(problem, starts=1 if known else starts, seed=seed, weights=self.weights, warm=warm, shared=self.shared)
         except ValueError as error:
             return str(error)
 
@@ -139,9 +144,22 @@ class _Search:
             self.progress(done, f"{tag}: {len(names)} candidates")
         return names
 
+    @cached_property
+    def rounding(self) -> float:
+        """Mean square below which nothing is claimed."""
+        return self.problem.rounding_floor
+
+    def residual(self, found: Fit) -> NDArray[np.float64]:
+        """Residual (N,) of a fit, kept while its round lasts: long recordings are walked through once for each."""
+        if id(found) not in self.kept:
+            if len(self.kept) * found.problem.size > KEPT:
+                self.kept.clear()
+            self.kept[id(found)] = found, found.problem.residual(found.theta)
+        return self.kept[id(found)][1]
+
     def statistic(self, with_it: Fit, without: Fit, variance: NDArray[np.float64]) -> float:
         """Drop of the sum of squares over the noise variance along it; chi-squared with the added parameters if there is only noise."""
-        weighted = with_it.weights * (without.problem.residual(without.theta) - with_it.problem.residual(with_it.theta)) ** 2
+        weighted = with_it.weights * (self.residual(without) - self.residual(with_it)) ** 2
         change = float(np.sum(weighted))
         if change == 0:
             return 0.0
@@ -157,8 +175,8 @@ class _Search:
     def variance(self, found: Fit) -> NDArray[np.float64]:
         """Noise (N,): the spectrum of what a fit leaves, but nowhere less than the stated sensor noise, and never less than rounding."""
         problem = found.problem
-        rounding = problem.rounding_floor * problem.samples / float(np.sum(problem.weight))
-        left = smoothed_variance(problem, problem.residual(found.theta))
+        rounding = self.rounding * problem.samples / float(np.sum(problem.weight))
+        left = smoothed_variance(problem, self.residual(found))
         return np.maximum(np.maximum(left, problem.noise_variance), rounding)
 
 
@@ -206,15 +224,33 @@ def select(problem: Problem, candidates: Sequence[Element], *, eps1: float | Non
     named = {key(c): c for c in candidates}
     if len(named) != len(candidates):
         raise ValueError(f"two candidates share a name: {sorted(key(c) for c in candidates)}")
-    search = _Search(problem, eps1, eps2, starts, seed, weights, workers, progress)
-    linear = fit(problem, starts=starts, seed=seed, weights=weights)
+    weights = problem.default_weight if weights is None else weights
+    shared = _shared(problem, candidates, weights)
+    search = _Search(problem, eps1, eps2, starts, seed, weights, workers, progress, shared)
+    linear = fit(problem, starts=starts, seed=seed, weights=weights, shared=shared)
     chosen, current, path, tried = _forward(search, named, linear, most)
     kept, current = _backward(search, chosen, current, path, tried)
     final_problem = problem.with_elements(problem.model.elements + tuple(named[name] for name in kept))
-    final = fit(final_problem, starts=starts, seed=seed, weights=weights, warm=current.values)
+    final = fit(final_problem, starts=starts, seed=seed, weights=weights, warm=current.values, shared=shared)
     if progress is not None:
         progress(1.0, f"selected {', '.join(kept) or 'nothing'}")
     return Selection(tuple(named[x] for x in chosen), tuple(named[x] for x in kept), tuple(path), tuple(tried), final, linear.mse)
+
+
+def _shared(problem: Problem, candidates: Sequence[Element], weights: NDArray[np.float64]) -> Condensed | None:
+    """Columns of the problem and of all candidates that tables can hold, condensed once, so that no fit walks through the recordings."""
+    known = {(e.term.name, name) for e in problem.model.elements for name in e.locations}
+    fitting: list[Element] = []
+    for candidate in sorted(candidates, key=key):
+        if any((candidate.term.name, name) in known for name in candidate.locations):
+            continue
+        try:
+            if tabled(problem.with_elements((*problem.model.elements, candidate)), rough=True):
+                fitting.append(candidate)
+                known |= {(candidate.term.name, name) for name in candidate.locations}
+        except ValueError:
+            continue
+    return condense(problem.with_elements((*problem.model.elements, *fitting)), weights)
 
 
 def _forward(search: _Search, named: dict[str, Element], linear: Fit, most: int) -> tuple[list[str], Fit, list[Step], list[Trial]]:
@@ -259,14 +295,14 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
         reason = f"mean square {current.mse:.3g} -> {fits[best].mse:.3g}" + ("" if accepted else f", less than eps2 = {search.eps2:.3g}")
     else:
         clear = [name for name in order if _clear(values[name], limits[name], current.mse - fits[name].mse, current.mse)]
-        best = _smallest(clear, fits, variance, search.problem.rounding_floor) if clear else order[0]
-        accepted = bool(clear) and current.mse > search.problem.rounding_floor
+        best = _smallest(search, clear, fits, variance) if clear else order[0]
+        accepted = bool(clear) and current.mse > search.rounding
         reason = f"mean square {current.mse:.3g} -> {fits[best].mse:.3g}; {values[best]:.3g} against {limits[best]:.3g} by noise"
         if not accepted:
-            floor = max(search.problem.floor, search.problem.rounding_floor)
+            floor = max(search.problem.floor, search.rounding)
             reason += f"; noise floor {floor:.3g}" if floor else ""
     aliases = tuple(name for name in order if accepted and name != best
-                    and _same(fits[name], fits[best], variance, search.problem.rounding_floor))
+                    and _same(search, fits[name], fits[best], variance))
     return Step(number, "add", best, fits[best].mse, accepted, reason, aliases), fits
 
 
@@ -275,18 +311,20 @@ def _clear(statistic: float, limit: float, drop: float, mse: float) -> bool:
     return statistic > limit and (drop > LEAST_GAIN * mse or statistic > 10 * limit)
 
 
-def _smallest(clear: list[str], fits: dict[str, Fit], variance: NDArray[np.float64], rounding: float) -> str:
+def _smallest(search: _Search, clear: list[str], fits: dict[str, Fit], variance: NDArray[np.float64]) -> str:
     """Of the candidates as good as the best (to a twentieth, or as far as noise can tell) the one with the fewest parameters."""
     first = fits[clear[0]]
-    level = [name for name in clear if fits[name].mse <= (1 + LEAST_GAIN) * first.mse or _same(fits[name], first, variance, rounding)]
+    level = [name for name in clear if fits[name].mse <= (1 + LEAST_GAIN) * first.mse or _same(search, fits[name], first, variance)]
     return min(level, key=lambda name: (len(fits[name].theta), level.index(name)))
 
 
-def _same(other: Fit, best: Fit, variance: NDArray[np.float64], rounding: float) -> bool:
+def _same(search: _Search, other: Fit, best: Fit, variance: NDArray[np.float64]) -> bool:
     """Whether noise explains the difference of two scores: the sum of squares differs by less than three of its standard deviations."""
-    change = best.weights * (other.problem.residual(other.theta) - best.problem.residual(best.theta))
+    if other.mse > 2 * best.mse + search.rounding:   # no noise in sight; spares long recordings
+        return False
+    change = best.weights * (search.residual(other) - search.residual(best))
     spread = 2 * np.sqrt(float(np.sum(change**2 * variance))) / best.problem.samples
-    return other.mse - best.mse <= 3 * spread + max(rounding, 1e-9 * best.mse)
+    return other.mse - best.mse <= 3 * spread + max(search.rounding, 1e-9 * best.mse)
 
 
 def _backward(search: _Search, chosen: list[str], current: Fit, path: list[Step], tried: list[Trial]) -> tuple[list[str], Fit]:

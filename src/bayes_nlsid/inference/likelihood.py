@@ -15,6 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayes_nlsid.identification.condensed import Regression, condense, tabled
 from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.elimination import jacobian
 from bayes_nlsid.identification.fit import Fit, fit
@@ -61,26 +62,23 @@ class Likelihood(ABC):
 class GaussianResidual:
     """Independent Gaussian entries of given variance, each record's information reduced by its taper.
 
-    Where every parameter but frequencies and damping ratios enters linearly, the sum of squares is a quadratic form in the
-    coefficients, worked out once around a reference point: its cost does not depend on the length of the recordings.
+    Where force tables hold all laws the sum of squares is that of the condensed residual (``identification.condensed``): its cost does not
+    depend on the length of the recordings.
 
     Parameters
     ----------
     problem : Problem
     variance : ndarray (N,)
-    reference : ndarray (P,)
-        Point around which the quadratic form is expanded.
     block : ndarray (N,) of int
         Block of every entry.
     """
 
     problem: Problem
     variance: NDArray[np.float64] = field(repr=False)
-    reference: NDArray[np.float64] = field(repr=False)
     block: NDArray[np.intp] = field(repr=False)
     weights: NDArray[np.float64] = field(init=False, repr=False)
     offset: NDArray[np.float64] = field(init=False, repr=False)
-    _form: tuple[NDArray[np.float64], NDArray[np.float64], float] | None = field(init=False, repr=False)
+    _condensed: Regression | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.variance.shape != (self.problem.size,) or not (np.isfinite(self.variance).all() and (self.variance > 0).all()):
@@ -89,31 +87,14 @@ class GaussianResidual:
         information = np.array([s.information for s in self.problem.observed.spectra])[self.problem.record]
         object.__setattr__(self, "weights", information / self.variance)
         object.__setattr__(self, "offset", -0.5 * information * np.log(2 * np.pi * self.variance))
-        object.__setattr__(self, "_form", None if self.problem.pieces else self._expand())
-
-    def _expand(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        columns = self._columns()
-        residual = self.problem.residual(self.reference)
-        weighted = columns * self.weights
-        return weighted @ columns.T, weighted @ residual, float(self.weights @ residual**2)
-
-    def _columns(self) -> NDArray[np.float64]:
-        seen = self.problem.observed
-        rows = [np.where(seen.equation == k, x, 0.0) for k in self.problem.model.free_modes for x in (seen.velocity, seen.displacement)]
-        return np.concatenate([np.array(rows).reshape(len(rows), seen.size), self.problem.columns])
-
-    def _coefficients(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        omega, zeta = self.problem.model.linear_values(theta)
-        modes = [x[..., k] for k in self.problem.model.free_modes for x in (2 * zeta * omega, omega**2)]
-        return np.stack([*modes, *(theta[..., i] for i in self.problem.linear_index)], axis=-1) if modes or self.problem.linear_index \
-            else np.zeros((*theta.shape[:-1], 0))
+        condensed = condense(self.problem, self.weights) if tabled(self.problem) else None
+        object.__setattr__(self, "_condensed", None if condensed is None else condensed.of(self.problem))
 
     def total(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """(W,) log-likelihood."""
-        if self._form is not None:
-            matrix, vector, constant = self._form
-            move = self._coefficients(theta) - self._coefficients(self.reference)
-            squares = constant + 2 * np.einsum("wi,i->w", move, vector) + np.einsum("wi,ij,wj->w", move, matrix, move)
+        if self._condensed is not None:
+            with np.errstate(all="ignore"):
+                squares = np.sum(self._condensed.residual(theta) ** 2, axis=1)
             return _finite(-0.5 * squares + self.offset.sum())
         out = np.empty(len(theta))
         step = max(1, ENTRIES // self.problem.size)
@@ -199,7 +180,7 @@ class WhittleLikelihood(Likelihood):
             current = again if np.isfinite(again.mse) else current
         self.width = width
         self.fit = current
-        self._gaussian = _gaussian(problem, whittle_variance(problem, current.theta, width), current.theta)
+        self._gaussian = _gaussian(problem, whittle_variance(problem, current.theta, width))
 
     @property
     def problem(self) -> Problem:
@@ -254,7 +235,7 @@ class PlainLikelihood(Likelihood):
         for cell in start.problem.cells:
             variance[cell.entries] = np.mean(residual[cell.entries] ** 2)
         self.fit = start
-        self._gaussian = _gaussian(start.problem, variance * _spent(start.problem), start.theta)
+        self._gaussian = _gaussian(start.problem, variance * _spent(start.problem))
 
     @property
     def problem(self) -> Problem:
@@ -298,8 +279,8 @@ def _spent(problem: Problem) -> float:
     return problem.size / max(1.0, problem.size - len(problem.names))
 
 
-def _gaussian(problem: Problem, variance: NDArray[np.float64], theta: NDArray[np.float64]) -> GaussianResidual:
-    return GaussianResidual(problem, variance, theta, frequency_blocks(problem)[0])
+def _gaussian(problem: Problem, variance: NDArray[np.float64]) -> GaussianResidual:
+    return GaussianResidual(problem, variance, frequency_blocks(problem)[0])
 
 
 def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64],
