@@ -222,6 +222,41 @@ def test_progress_line_and_log(tmp_path: Path) -> None:
     assert (tmp_path / "a.log").read_text() == (tmp_path / "b.log").read_text() and "not computed yet" in (tmp_path / "a.log").read_text()
 
 
+def test_time_left_is_that_of_the_present_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of an earlier run pass at once; then one per cent takes ten seconds. Where nothing moves, nothing is promised."""
+    from io import StringIO
+
+    now = [100.0]
+    monkeypatch.setattr("bayes_nlsid.study.progress.time.monotonic", lambda: now[0])
+    terminal = StringIO()
+    told = Reporter((), terminal)
+    told.begin(1, 1, "posterior", "x")
+    for share in (0.1, 0.3, 0.6):
+        now[0] += 0.2
+        told.update(share, "")
+    for step in range(20):
+        now[0] += 10.0
+        told.update(0.6 + 0.01 * (step + 1), "")
+    assert "80 %, about 3 min 20 s left" in terminal.getvalue().replace("  ", " ")  # 20 more of 10 s each
+    told.begin(1, 1, "posterior", "x")
+    for _ in range(20):
+        now[0] += 10.0
+        told.update(0.5, "")
+    assert "left" not in terminal.getvalue().rpartition("...")[2].rpartition("\r")[2]
+
+
+def test_the_log_tells_a_colleague_what_was_done(finished: Path, small: Path, tmp_path: Path) -> None:
+    text = log_of(finished)
+    first, last = text.splitlines()[0], text.splitlines()[-1]
+    assert "small.toml, seed 1, 1 worker, local" in first and "numpy" in first and "input recording.npz: SHA-256" in text
+    assert "was chosen from the library" in text and "Next:" in last
+    bad = small.with_name("log_bad.toml")
+    bad.write_text(small.read_text(encoding="utf-8").replace('"acceleration"', '"absent"', 1), encoding="utf-8")
+    with pytest.raises(InputError):
+        run_study(read_study(bad), tmp_path)
+    assert "refused: " in log_of(tmp_path).splitlines()[-1] and "absent" in log_of(tmp_path)
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0.04, "0.0 s"), (12.4, "12 s"), (75, "1 min 15 s"), (7200, "2 h 0 min")])
 def test_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text

@@ -209,7 +209,8 @@ def _convergence_reasons(names: Sequence[str], n: int, tau: Array, rhat: Array, 
         reasons.append("one ensemble alone cannot show that it found every mode; run at least two")
     short = [name for name, t in zip(names, tau, strict=True) if not n >= LENGTH * t]
     if short:
-        reasons.append(f"{n} steps are fewer than {LENGTH:g} autocorrelation times of {', '.join(short)} (largest {np.max(tau):.3g} steps)")
+        reasons.append(f"{n} steps are fewer than {LENGTH:g} autocorrelation times of {', '.join(short)} (largest {np.max(tau):.3g} steps)"
+                       + (f": about {int(np.ceil(LENGTH * np.max(tau))) - n} more are needed" if np.isfinite(np.max(tau)) else ""))
     few = [name for name, e in zip(names, ess, strict=True) if not e >= LEAST_ESS]
     if few:
         reasons.append(f"fewer than {LEAST_ESS:g} effective samples of {', '.join(few)} (least {np.min(ess):.0f})")

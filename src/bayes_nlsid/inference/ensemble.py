@@ -7,7 +7,6 @@ distance to the anchor without paying for it, and gives a Gaussian in five dimen
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -222,7 +221,6 @@ class _Run:
     redrawn: int = 0
     stopped: str = ""
     next_check: int = 0
-    began: float = field(default_factory=time.monotonic)
 
     def go(self, states: list[Walkers], crew: Crew) -> _Run:
         """Run blocks until the rule holds, the budget is spent or somebody stops it."""
@@ -308,9 +306,8 @@ class _Run:
             s = self._chain(max(self.burn_blocks, len(self.blocks) // 2))[0]
             wanted = self.steps or LENGTH * max(integrated_time(s[..., i]) for i in range(s.shape[-1]))
             budget = int(min(self.most, max(done, self.burn_blocks * self.block + min(wanted, self.most))))
-        left = (time.monotonic() - self.began) * max(0.0, budget / done - 1)
         state = "burn-in" if self.burn_blocks is None else "sampling"
-        self.progress(min(1.0, done / budget), f"{state}: {done} steps of about {budget}, about {left:.0f} s left")
+        self.progress(min(1.0, done / budget), f"{state}: {done} steps of about {budget}")
 
     def posterior(self, seed: int) -> Posterior:
         """Draws after burn-in with their diagnostics, thinned to a size that can be kept."""

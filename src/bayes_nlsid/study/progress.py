@@ -36,10 +36,12 @@ class Reporter:
         self._logs, self._terminal = logs, terminal
         self._label, self._began, self._shown = "", time.monotonic(), 0.0
         self._width = 0
+        self._passed: list[tuple[float, float]] = []  # (when, share) of the current stage
 
     def begin(self, number: int, count: int, stage: str, why: str) -> None:
         """A stage starts; ``why`` says what makes it necessary."""
         self._label, self._began = f"[{number}/{count}] {stage}", time.monotonic()
+        self._passed = [(self._began, 0.0)]
         self._record(f"{self._label}: begun ({why})")
         self._line(f"{self._label} ...")
 
@@ -49,9 +51,23 @@ class Reporter:
         if now - self._shown < 0.1 and share < 1:
             return
         self._shown = now
-        spent = now - self._began
-        rest = f", about {duration(spent * (1 - share) / share)} left" if 0.02 < share < 1 and spent > 2 else ""
+        left = self._left(now, share)
+        rest = "" if left is None else f", about {duration(left)} left"
         self._line(f"{self._label} {100 * min(max(share, 0.0), 1.0):3.0f} %{rest}  {sentence}")
+
+    def _left(self, now: float, share: float) -> float | None:
+        """Seconds left at the pace of the later half of the stage so far; None where that says nothing.
+
+        What an earlier run had finished passes at once, so the pace since the beginning would promise too much.
+        """
+        self._passed.append((now, share))
+        since = now - max(5.0, 0.5 * (now - self._began))
+        while len(self._passed) > 2 and self._passed[1][0] <= since:
+            self._passed.pop(0)
+        then, before = self._passed[0]
+        if now - self._began < 2 or not before + 0.01 < share < 1:
+            return None
+        return (now - then) * (1 - share) / (share - before)
 
     def end(self, seconds: float, reused: bool) -> None:
         """The current stage is finished."""
@@ -71,6 +87,10 @@ class Reporter:
             self._terminal.write(f"\r  {sentence}\n")
             self._terminal.flush()
             self._width = 0
+
+    def log(self, sentence: str) -> None:
+        """A sentence for the log alone."""
+        self._record(sentence)
 
     def _line(self, text: str) -> None:
         if self._terminal is None:
