@@ -30,7 +30,7 @@ DAMPINGS = 10.0 ** np.arange(-2, 3)   # tried together, times the current one
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Run:
+class Run:
     """One recording: what is compared, and the modal state from which its simulation starts."""
 
     recording: Recording
@@ -55,7 +55,7 @@ class OutputError:
     Parameters
     ----------
     problem : Problem
-    runs : tuple of _Run
+    runs : tuple of Run
     substeps : tuple of int
         Integration steps per sample, fixed so that differences do not see the integrator change.
     compiled : bool or None
@@ -66,7 +66,7 @@ class OutputError:
     """
 
     problem: Problem
-    runs: tuple[_Run, ...] = field(repr=False)
+    runs: tuple[Run, ...] = field(repr=False)
     substeps: tuple[int, ...]
     compiled: bool | None = None
     coordinates: Coordinates = field(init=False, repr=False)
@@ -92,22 +92,24 @@ class OutputError:
 
     def residual(self, x: Array) -> Array:
         """Scaled in-band differences (S, N) of x (S, P + initial states), all in one batch; infinite where a simulation failed."""
-        count, _ = self.size
-        theta = self.theta(x)
-        parts, at = [], count
+        return self.difference(self.theta(x), x[:, self.size[0]:])
+
+    def difference(self, theta: Array, states: Array, refine: int = 1) -> Array:
+        """The same for theta (S, P) and unknown initial states (S, U) in units of their spread, with ``refine`` times the substeps."""
+        parts, at = [], 0
         for run, substeps in zip(self.runs, self.substeps, strict=True):
-            states = x[:, at:at + len(run.unknown)]
+            u0, v0 = start_state(run, states[:, at:at + len(run.unknown)])
             at += len(run.unknown)
-            u0, v0 = _state(run, states)
-            found = predict_record(self.problem.model, theta, run.recording, substeps=substeps, u0=u0, v0=v0, compiled=self.compiled)
+            found = predict_record(self.problem.model, theta, run.recording, substeps=refine * substeps, u0=u0, v0=v0,
+                                   compiled=self.compiled)
             with np.errstate(all="ignore"):
                 values = np.moveaxis(run.spectrum.apply(np.moveaxis(found.values / run.scale, 1, 2)), 1, 2) - run.measured
             values[~found.ok] = np.inf
-            parts.append(values.reshape(len(x), -1))
+            parts.append(values.reshape(len(theta), -1))
         return np.concatenate(parts, axis=1)
 
 
-def _state(run: _Run, states: Array) -> tuple[Array | None, Array | None]:
+def start_state(run: Run, states: Array) -> tuple[Array | None, Array | None]:
     """Modal state (S, m), (S, m) at the first sample for unknown parts (S, unknown) in units of their spread."""
     if run.u0 is None or run.v0 is None:
         return None, None
@@ -152,7 +154,7 @@ def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int =
     if not np.isfinite(fit.theta).all():
         raise ValueError(f"the fit has failed ({', '.join(fit.reasons)}); output error needs a finite starting point")
     began = time.perf_counter()
-    error, x = _prepare(fit, recordings, tolerance, iterations)
+    error, x = prepare(fit, recordings, tolerance, iterations)
     first = error.residual(x[None])[0]
     if not np.isfinite(first).all():
         return replace(fit, reasons=(*fit.reasons, "output error: the simulation from the regression failed; the regression stands"))
@@ -169,7 +171,15 @@ def output_error(fit: Fit, recordings: Sequence[Recording], *, iterations: int =
                problem, fit.weights, fit.seed)
 
 
-def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float, iterations: int) -> tuple[OutputError, Array]:
+def prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float, iterations: int,
+            compiled: bool | None = None) -> tuple[OutputError, Array]:
+    """What is compared, ready to be simulated, and the point (P + initial states,) that the fit stands for.
+
+    Raises
+    ------
+    ValueError
+        If a recording has no modal data in the problem.
+    """
     problem = fit.problem
     named = {d.name: i for i, d in enumerate(problem.data)}
     missing = [r.name for r in recordings if r.name not in named]
@@ -184,14 +194,15 @@ def _prepare(fit: Fit, recordings: Sequence[Recording], tolerance: float, iterat
         spectra.append(spectrum)
         measured.append(spectrum.apply(part.response.T).T)
     scales = _scales([c[0] for c in cut], measured)
-    runs = tuple(_Run(part, spectrum, values / scale, scale, u0, v0, spread)
+    runs = tuple(Run(part, spectrum, values / scale, scale, u0, v0, spread)
                  for (part, u0, v0, spread), spectrum, values, scale in zip(cut, spectra, measured, scales, strict=True))
     # many runs follow: the compiled loop is worth loading for all of them where it would not be for one
     batch = len(problem.names) + sum(len(run.unknown) for run in runs) + len(DAMPINGS)
-    compiled = True if iterations * (1 + batch / EVEN_BATCH) * sum(run.recording.n for run in runs) > LONG_RUN else None
+    if compiled is None and iterations * (1 + batch / EVEN_BATCH) * sum(run.recording.n for run in runs) > LONG_RUN:
+        compiled = True
     substeps = []
     for run in runs:
-        u0, v0 = _state(run, np.zeros((1, len(run.unknown))))
+        u0, v0 = start_state(run, np.zeros((1, len(run.unknown))))
         substeps.append(predict_record(problem.model, fit.theta[None], run.recording, tolerance=tolerance, u0=u0, v0=v0,
                                        compiled=compiled).substeps)
     error = OutputError(problem, runs, tuple(substeps), compiled)

@@ -75,6 +75,29 @@ def to_inference_data(posterior: Posterior, likelihood: Likelihood | None = None
         return arviz.InferenceData(attrs=attributes, **groups)
 
 
+def pareto_smoothed(log_weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Normalised importance weights (S,), the largest smoothed by a generalised Pareto distribution, and its shape k-hat.
+
+    Above 0.7 the weights cannot be relied on (Vehtari, Simpson, Gelman, Yao and Gabry, J. Mach. Learn. Res. 25 (2024) 72). Points of zero
+    weight have log weight −inf.
+    """
+    log_weights = np.asarray(log_weights, dtype=float)
+    out = np.zeros(log_weights.shape)
+    alive = np.isfinite(log_weights)
+    if alive.sum() < 25:
+        return out, float("inf")
+    if np.ptp(log_weights[alive]) < 1e-9:
+        out[alive] = 1 / alive.sum()
+        return out, float("-inf")
+    with _quiet():
+        import arviz
+
+        smoothed, shape = arviz.psislw(log_weights[alive] - log_weights[alive].max())
+    weights = np.exp(smoothed - np.max(smoothed))
+    out[alive] = weights / weights.sum()
+    return out, float(shape)
+
+
 def write_netcdf(data: Any, path: Path | str) -> None:
     """Write InferenceData to netCDF with h5netcdf, at once or not at all."""
     target = Path(path)

@@ -56,6 +56,14 @@ class Likelihood(ABC):
     def describe(self) -> str:
         """In words, for the report; part of the identity of a run."""
 
+    def curvature(self, theta: NDArray[np.float64], coordinates: Coordinates) -> NDArray[np.float64]:
+        """Information (P, P) of the recordings around theta (P,), in the given coordinates: here that of the residual of Eq. 13."""
+        slope = jacobian(self.problem, theta) * np.sqrt(self.weights)[:, None]
+        stretch = coordinates.log_jacobian(coordinates.to_s(theta)) - self.problem.coordinates.log_jacobian(self.problem.to_s(theta))
+        slope = slope * np.exp(stretch)
+        slope = np.where(np.isfinite(slope), slope, 0.0)
+        return np.asarray(slope.T @ slope)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -289,11 +297,6 @@ def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArra
 
     In the given coordinates, None: those of the problem; ``prior_sd`` must be in the same.
     """
-    problem = likelihood.problem
-    slope = jacobian(problem, theta) * np.sqrt(likelihood.weights)[:, None]
-    if coordinates is not None:
-        stretch = coordinates.log_jacobian(coordinates.to_s(theta)) - problem.coordinates.log_jacobian(problem.to_s(theta))
-        slope = slope * np.exp(stretch)
-    slope = np.where(np.isfinite(slope), slope, 0.0) * prior_sd
-    values, vectors = np.linalg.eigh(slope.T @ slope)
+    information = likelihood.curvature(theta, likelihood.problem.coordinates if coordinates is None else coordinates)
+    values, vectors = np.linalg.eigh(information * np.outer(prior_sd, prior_sd))
     return (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T * np.outer(prior_sd, prior_sd)

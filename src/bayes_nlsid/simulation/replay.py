@@ -68,7 +68,7 @@ class Replay:
 
 def predict_record(model: Model, theta: ArrayLike, recording: Recording, *, u0: ArrayLike | None = None, v0: ArrayLike | None = None,
                    scheme: SchemeName = "exponential", tolerance: float = TOLERANCE, substeps: int | None = None,
-                   compiled: bool | None = None, progress: Callable[[str], None] | None = None) -> Replay:
+                   compiled: bool | None = None, progress: Callable[[str], None] | None = None, extra: Array | None = None) -> Replay:
     """Simulate what the sensors of a recording would have shown.
 
     Parameters
@@ -88,6 +88,8 @@ def predict_record(model: Model, theta: ArrayLike, recording: Recording, *, u0: 
         Steps per sample, if known.
     compiled, progress
         As in ``simulate``.
+    extra : ndarray (S, n, k) or None
+        Force, N, that acts on each sample beside the recorded one, in the order of the model's inputs; transients only.
 
     Returns
     -------
@@ -98,6 +100,8 @@ def predict_record(model: Model, theta: ArrayLike, recording: Recording, *, u0: 
     ValueError
         If a channel or an input sits at a location that the model does not know, or a free decay comes without a start.
     """
+    if extra is not None and recording.period is not None:
+        raise ValueError(f"recording {recording.name!r} is periodic; extra forces are for transients only")
     values = np.atleast_2d(np.asarray(theta, dtype=float))
     locations = tuple(dict.fromkeys(c.location for c in recording.channels))
     model.linear.rows(locations)
@@ -111,7 +115,11 @@ def predict_record(model: Model, theta: ArrayLike, recording: Recording, *, u0: 
     if recording.period is not None and not recording.free:
         out, status, drift, end = _steady(source, values, substeps)
     else:
-        found = source.run(values, substeps, source.force(substeps), start, 0)
+        force = source.force(substeps)
+        if extra is not None:
+            beside = np.moveaxis(_finer(np.moveaxis(extra, 1, 0), substeps), 0, 1)
+            force = beside if force is None else force + beside
+        found = source.run(values, substeps, force, start, 0)
         out, status, drift, end = found[0], found[1], np.zeros(len(values)), found[2]
     return Replay(out, status, substeps, error, drift, end[0], end[1])
 
