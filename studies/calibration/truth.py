@@ -11,7 +11,6 @@ them, less their stiffness when all stick.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,8 @@ FINE = 8                                    # integration steps per sample
 BAND = (45.0, 200.0)                        # Hz
 AMPLITUDE = 1.6                             # N
 F0, ZETA = 78.56, 0.004
-STATIC = ("f[1]", "zeta[1]", "q|q|[M].k", "v|v|[M].c")
+SLIDERS = 60
+STICK, SHARE = 8e3, 0.5     # N/m and ratio: parameters of the joint with memory that are known
 Array = np.ndarray
 
 
@@ -53,13 +53,53 @@ def force(time: Array) -> Array:
     return AMPLITUDE * np.sin(0.5 * np.pi * edge) ** 2 * np.sin(phase)
 
 
-def static_law(parameters: Array) -> Callable[[Array, Array], Array]:
-    """k₂ u|u| + c₂ v|v|; parameters (R, 4) in the order of ``STATIC``."""
-    k2, c2 = parameters[:, 2], parameters[:, 3]
-    return lambda u, v: k2 * u * np.abs(u) + c2 * v * np.abs(v)
+class Static:
+    """k₂ u|u| + c₂ v|v|; parameters (R, 4): Hz, ratio, N/m², N s²/m²."""
+
+    def __init__(self, parameters: Array) -> None:
+        self.k2, self.c2 = parameters[:, 2], parameters[:, 3]
+
+    def force(self, u: Array, v: Array) -> Array:
+        """N."""
+        return self.k2 * u * np.abs(u) + self.c2 * v * np.abs(v)
+
+    def commit(self, u: Array) -> None:
+        """No memory."""
 
 
-def integrate(frequency: Array, zeta: Array, law: Callable[[Array, Array], Array], disturbance: Array | None) -> tuple[Array, Array]:
+class Sliders:
+    """Springs in series with sliders, whose yield displacements φ have the density R φ^χ up to φ_max and a lump there (Segalman 2005).
+
+    Parameters (R, 4): Hz, ratio, N, −; stiffness when stuck and the lump's share are ``STICK`` and ``SHARE``. The spring that all of them
+    make when stuck belongs to the linear part, so it is taken off.
+    """
+
+    def __init__(self, parameters: Array) -> None:
+        slip, chi = parameters[:, 2:3], parameters[:, 3:4]
+        share = SHARE + (chi + 1) / (chi + 2)
+        largest = slip * (1 + SHARE) / (STICK * share)
+        density = slip * (chi + 1) / (largest ** (chi + 2) * share)
+        edges = largest * np.concatenate([[0.0], np.geomspace(1e-4, 1.0, SLIDERS)])
+        part = np.diff(edges ** (chi + 1), axis=1) * density / (chi + 1)
+        middle = np.diff(edges ** (chi + 2), axis=1) / (chi + 2) / (np.diff(edges ** (chi + 1), axis=1) / (chi + 1))
+        lump = SHARE * density * largest ** (chi + 1) / (chi + 1)
+        self.stiffness = np.concatenate([part, lump], axis=1)
+        self.most = self.stiffness * np.concatenate([middle, largest], axis=1)
+        self.now, self.last = np.zeros(self.most.shape), np.zeros(len(parameters))
+
+    def _forces(self, u: Array) -> Array:
+        return np.clip(self.now + self.stiffness * (u - self.last)[:, None], -self.most, self.most)
+
+    def force(self, u: Array, v: Array) -> Array:
+        """N."""
+        return self._forces(u).sum(axis=1) - self.stiffness.sum(axis=1) * u
+
+    def commit(self, u: Array) -> None:
+        """The step has ended here."""
+        self.now, self.last = self._forces(u), u
+
+
+def integrate(frequency: Array, zeta: Array, law: Static | Sliders, disturbance: Array | None) -> tuple[Array, Array]:
     """Displacement and acceleration (R, n) at the rate ``FS``; ``disturbance`` (R, n · FINE), N, held over each fine step."""
     n, h = round(FS * SECONDS), 1 / (FS * FINE)
     p = force(h / 2 * np.arange(2 * n * FINE + 1))
@@ -71,7 +111,7 @@ def integrate(frequency: Array, zeta: Array, law: Callable[[Array, Array], Array
         w = 0.0 if disturbance is None else disturbance[:, i]
 
         def rate(x: Array, y: Array, push: float, w: Array | float = w) -> Array:
-            return push + w - c * y - k * x - law(x, y)
+            return push + w - c * y - k * x - law.force(x, y)
 
         a1 = rate(u, v, p[2 * i])
         if i % FINE == 0:
@@ -86,6 +126,7 @@ def integrate(frequency: Array, zeta: Array, law: Callable[[Array, Array], Array
         a4 = rate(u4, v4, p[2 * i + 2])
         u = u + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
         v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        law.commit(u)
     return out[0], out[1]
 
 
@@ -111,7 +152,7 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], coloured: bool) -> A
 
 
 def measure(scenario: Scenario, parameters: Array, rng: np.random.Generator,
-            law: Callable[[Array], Callable[[Array, Array], Array]] = static_law) -> Array:
+            law: type[Static] | type[Sliders] = Static) -> Array:
     """Channels (R, n, s) of a virtual test for parameters (R, P), frequency and damping ratio first."""
     count, n = len(parameters), round(FS * SECONDS)
     disturbance = None

@@ -217,14 +217,14 @@ def forward_likelihood(fit: Fit, recordings: Sequence[Recording], priors: Sequen
     for i in range(rounds):
         if progress is not None:
             progress(0.3 + 0.6 * i / rounds, "noise levels and parameters in turn")
-        noise = _with_states(noise, best).estimated(best.error)
+        noise = _with_states(noise, error, best).estimated(best.error)
         if i == 0:
             noise, dropped = _without_outliers(error, noise, best)
         search = search.corrected(best) if i == rounds - 1 else search
         found = search.descend(best.s, best.states, _without_states(noise, error))
         if found is not None:
             best = found[0]
-    noise = _with_states(noise, best)
+    noise = _with_states(noise, error, best)
     return ForwardLikelihood(search.error, noise, search.coordinates, _marginal(best, noise, search), dropped, search.missing)
 
 
@@ -436,13 +436,13 @@ def _full_noise(error: OutputError, at: Expansion, search: _Search, plain: Noise
     return Noise(layouts, Levels(knots, np.array(sources)), plain.information)
 
 
-def _with_states(noise: Noise, at: Expansion) -> Noise:
-    """Initial states among the nuisance directions."""
+def _with_states(noise: Noise, error: OutputError, at: Expansion) -> Noise:
+    """Residual terms and initial states as nuisance directions."""
     count = len(at.s)
     layouts = []
-    for layout, columns in zip(noise.layouts, noise.split(at.slope[:, count:].T), strict=True):
+    for layout, run, columns in zip(noise.layouts, error.runs, noise.split(at.slope[:, count:].T), strict=True):
         used = columns[np.linalg.norm(columns, axis=1) > 0].T
-        layouts.append(replace(layout, nuisance=_orthonormal(np.concatenate([layout.nuisance, used], axis=1))))
+        layouts.append(replace(layout, nuisance=_orthonormal(np.concatenate([residual_terms(run), used], axis=1))))
     return replace(noise, layouts=tuple(layouts))
 
 
