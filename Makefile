@@ -22,3 +22,4 @@ bench:
 
 calibration:
 	$(PYTHON) start.py test -m slow
+	$(VENV) -m studies.calibration

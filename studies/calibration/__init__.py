@@ -1,0 +1,1 @@
+"""Simulation-based calibration of the posterior on virtual tests whose truth is known."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from studies.calibration import truth
 
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.fit import Fit, fit
@@ -15,7 +16,6 @@ from bayes_nlsid.model import Element, Model
 from bayes_nlsid.recordings.recording import Channel, Recording
 from bayes_nlsid.structure.chains import oscillator
 from bayes_nlsid.structure.sensing import modal_data
-from studies.calibration import truth
 
 UNITS = {"acceleration": "m/s^2", "displacement": "m"}
 AMPLITUDES = 1e-3 * np.array([0.1, 0.2, 0.35, 0.5, 0.7])     # m, within what the sweep reaches
@@ -53,7 +53,8 @@ class Case:
         """Truths (count, P) from the same priors (their bounds lie far outside)."""
         known = [("normal", truth.F0, 0.15), ("normal", truth.ZETA, 0.1 * truth.ZETA), *self.stated]
         z = rng.normal(size=(count, len(known)))
-        return np.stack([a * np.exp(b * x) if kind == "lognormal" else a + b * x for (kind, a, b), x in zip(known, z.T, strict=True)], axis=1)
+        return np.stack([a * np.exp(b * x) if kind == "lognormal" else a + b * x for (kind, a, b), x in zip(known, z.T, strict=True)],
+                        axis=1)
 
     def backbone(self, theta: Array) -> tuple[Array, Array]:
         """Frequency (Hz) and damping ratio (..., 5) at ``AMPLITUDES`` by first harmonics, in closed form."""

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
+from studies.calibration import truth
+from studies.calibration.cases import AMPLITUDES, CASES, Case
 
 from bayes_nlsid.identification.fit import Fit
 from bayes_nlsid.inference.forward import ForwardLikelihood, forward_likelihood
 from bayes_nlsid.inference.likelihood import WhittleLikelihood, laplace
-from bayes_nlsid.inference.reweighting import WORST_SHAPE, Weighted, around_optimum, forward_posterior
+from bayes_nlsid.inference.reweighting import WORST_SHAPE, around_optimum, forward_posterior
 from bayes_nlsid.study.store import versions
-from studies.calibration import truth
-from studies.calibration.cases import AMPLITUDES, CASES, Case
 
 LEVELS = (0.50, 0.90, 0.95)
 RANKS = 99              # posterior draws among which the truth is ranked

@@ -135,7 +135,8 @@ def hidden_mode(rng: np.random.Generator, count: int) -> Array:
     n = round(FS * SECONDS)
     frequency, zeta = 151.0 + rng.normal(size=(count, 1)), 0.003
     f = np.fft.rfftfreq(4 * n, 1 / FS)
-    drive = np.concatenate([np.tile(force(np.arange(n) / FS), (count, 1)) + 0.02 * rng.normal(size=(count, n)), np.zeros((count, 3 * n))], 1)
+    drive = np.concatenate([np.tile(force(np.arange(n) / FS), (count, 1)) + 0.02 * rng.normal(size=(count, n)),
+                            np.zeros((count, 3 * n))], 1)
     gain = -(f**2) / (frequency**2 - f**2 + 2j * zeta * frequency * f)
     return np.fft.irfft(np.fft.rfft(drive, axis=1) * gain, 4 * n, axis=1)[:, :n]
 

@@ -67,8 +67,9 @@ class Adequacy:
 
     def record(self) -> dict[str, Any]:
         """For ``result.json``."""
-        return {"found": self.misfit, "reasons": list(self.reasons), "innovation": self.innovation, "innovation_limit": self.innovation_limit,
-                "log_unmeasured_force": self.meter, "scores": [{"force": n, "z": z} for n, z in self.scores[:8]], "notes": list(self.notes)}
+        return {"found": self.misfit, "reasons": list(self.reasons), "innovation": self.innovation,
+                "innovation_limit": self.innovation_limit, "log_unmeasured_force": self.meter,
+                "scores": [{"force": n, "z": z} for n, z in self.scores[:8]], "notes": list(self.notes)}
 
 
 def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] = (), *, library: bool = True) -> Adequacy:
@@ -85,11 +86,12 @@ def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] 
     reasons = []
     ratio, limit = _innovation(likelihood, floors)
     if ratio is not None and limit is not None and ratio > limit:
-        reasons.append(f"the error of the simulation has {ratio:.3g} times the variance of the measured sensor noise (99.9 % limit {limit:.3g})")
+        reasons.append(f"the error of the simulation has {ratio:.3g} times the variance of the measured sensor noise "
+                       f"(99.9 % limit {limit:.3g})")
     meter = _meter(likelihood)
     if meter > METER:
-        reasons.append(f"the model must call unmeasured a force {np.exp(0.5 * meter):.2g} times as strong as sensor noise would feign: physics "
-                       f"left out, or a real disturbance")
+        reasons.append(f"the model must call unmeasured a force {np.exp(0.5 * meter):.2g} times as strong as sensor noise would feign: "
+                       f"physics left out, or a real disturbance")
     scores = _scores(likelihood) if library else ()
     if scores and abs(scores[0][1]) > SCORE:
         rivals = [name for name, z in scores[1:] if abs(z) > 0.6 * abs(scores[0][1])]
@@ -165,7 +167,7 @@ def _columns(likelihood: ForwardLikelihood, run: Any, substeps: int, theta: Arra
     if recording.period is not None:
         return [(name, np.zeros(run.measured.size)) for name in names]
     u0, v0 = (None if x is None else x[0] for x in start_state(run, states[None]))
-    watch = tuple(Channel(f"{place} {q}", place, q, "") for place in joints for q in ("displacement", "velocity"))  # type: ignore[arg-type]
+    watch = tuple(Channel(f"{place} {q}", place, q, "") for place in joints for q in ("displacement", "velocity"))
     seen = replace(recording, channels=watch, response=np.zeros((recording.n, len(watch))))
     common: dict[str, Any] = {"u0": u0, "v0": v0, "substeps": substeps, "compiled": likelihood.error.compiled}
     motion = predict_record(model, theta[None], seen, **common).values[0]

@@ -89,7 +89,7 @@ def pareto_smoothed(log_weights: NDArray[np.float64]) -> tuple[NDArray[np.float6
     if np.ptp(log_weights[alive]) < 1e-9:
         out[alive] = 1 / alive.sum()
         return out, float("-inf")
-    with _quiet():
+    with _quiet(), np.errstate(all="ignore"):
         import arviz
 
         smoothed, shape = arviz.psislw(log_weights[alive] - log_weights[alive].max())

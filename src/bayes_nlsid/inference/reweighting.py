@@ -57,7 +57,8 @@ class Weighted:
         order = np.argsort(self.theta, axis=0)
         values = np.take_along_axis(self.theta, order, axis=0)
         share = np.cumsum(self.weights[order], axis=0) - 0.5 * self.weights[order]
-        return np.stack([np.interp(probabilities, share[:, i], values[:, i]) for i in range(values.shape[1])], axis=1)
+        asked = np.asarray(probabilities, dtype=float)
+        return np.stack([np.interp(asked, share[:, i], values[:, i]) for i in range(values.shape[1])], axis=1)
 
     def resampled(self, count: int, rng: np.random.Generator) -> Array:
         """``count`` equally weighted draws (count, P), systematic resampling in random order."""
@@ -185,15 +186,15 @@ def _features(z: Array, degree: int) -> Array:
 
 def _fitted(move: Array, difference: Array) -> _Polynomial:
     middle = move.mean(axis=0)
-    root = np.linalg.inv(np.linalg.cholesky(np.cov(move.T).reshape(move.shape[1], -1)
+    root: Array = np.linalg.inv(np.linalg.cholesky(np.cov(move.T).reshape(move.shape[1], -1)
                                             + 1e-12 * np.diag(move.var(axis=0) + 1e-300))).T
     z = (move - middle) @ root
     degree = 3 if len(_features(z[:1], 3)[0]) * 3 < len(z) else 2
     design = _features(z, degree)
     penalty = RIDGE * len(z) * np.eye(design.shape[1])
     penalty[0, 0] = 0.0
-    coefficients = np.linalg.solve(design.T @ design + penalty, design.T @ difference)
-    return _Polynomial(middle, root, float(np.quantile(np.linalg.norm(z, axis=1), 0.98)), degree, coefficients)
+    coefficients = np.asarray(np.linalg.solve(design.T @ design + penalty, design.T @ difference), dtype=float)
+    return _Polynomial(middle, np.asarray(root, dtype=float), float(np.quantile(np.linalg.norm(z, axis=1), 0.98)), degree, coefficients)
 
 
 def forward_posterior(fit: Fit, likelihood: ForwardLikelihood, priors: Sequence[Prior], *, draws: int = DRAWS, ensembles: int = 4,
@@ -260,7 +261,8 @@ def _spread(chain: Posterior, count: int) -> Array:
     return np.asarray(flat[np.linspace(0, len(flat) - 1, min(count, len(flat))).round().astype(int)])
 
 
-def _equal(chain: Posterior, found: Weighted, likelihood: ForwardLikelihood, priors: Sequence[Prior], rng: np.random.Generator) -> Posterior:
+def _equal(chain: Posterior, found: Weighted, likelihood: ForwardLikelihood, priors: Sequence[Prior],
+           rng: np.random.Generator) -> Posterior:
     """Posterior of equally weighted draws with the diagnostics of chain and weights together."""
     ensembles = chain.theta.shape[0]
     count = len(found.theta) // ensembles * ensembles
