@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ BATCH = 48
 POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
+@final
 class Unmeasured(NamedTuple):
     """Columns (N, K_k) of every mode near resonance, and variance (Q, bins, s) away from it, for force of unit density."""
 
