@@ -142,3 +142,11 @@ def test_ten_thousand_samples_survive_kill_9(study: Path, tmp_path: Path) -> Non
         assert sorted(one.files) == sorted(other.files)
         assert all(np.array_equal(one[k], other[k], equal_nan=one[k].dtype.kind == "f") for k in one.files)
         assert len(one["samples_frequency"]) == 16384
+
+
+def test_an_interval_that_holds_zero_is_explained() -> None:
+    from bayes_nlsid.study.report_extras import chance_words
+
+    assert chance_words([{"name": "f", "total_low": 0.4}, {"name": "c", "total_low": None}]) == ""
+    said = chance_words([{"name": "f", "total_low": 0.4}, {"name": "zeta", "total_low": -0.02}])
+    assert "zeta hold zero" in said and "f" not in said.split("intervals of ")[1].split(" hold")[0]

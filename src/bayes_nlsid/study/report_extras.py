@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayes_nlsid.study import report_page as html
@@ -56,7 +56,17 @@ def scatter_section(done: Mapping[str, Saved]) -> str:
         head = [f"scatter of {name} at {engineering(ranked[0]['amplitude_m'], 'm')}", "first-order share", "90 % interval", "total share",
                 "90 % interval"] if ranked else []
         out += html.table(head, [[r["name"], *share_cells(r)] for r in ranked], "stages/montecarlo, montecarlo.json", numeric=(1, 2, 3, 4))
+        out += html.paragraph(chance_words(ranked), "soft") if chance_words(ranked) else ""
     return "".join(told) + out + html.listing(s["reasons"])
+
+
+def chance_words(ranked: Sequence[Mapping[str, Any]]) -> str:
+    """What an interval of a share that holds zero means; empty if none does."""
+    none = [r["name"] for r in ranked if r["total_low"] is not None and r["total_low"] <= 0]
+    if not none:
+        return ""
+    return (f"The intervals of {', '.join(none)} hold zero: with this many samples their share cannot be told from none. A share below "
+            "zero is chance, since shares are estimated from differences; more samples narrow it.")
 
 
 def share_cells(row: Mapping[str, Any]) -> list[str]:
