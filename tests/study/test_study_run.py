@@ -351,3 +351,17 @@ def test_a_frequency_at_its_bound_is_a_refusal(small: Path, quick: None, tmp_pat
     far.write_text(small.read_text(encoding="utf-8").replace('frequency = "20 Hz"', 'frequency = "35 Hz"'), encoding="utf-8")
     result = run_study(read_study(far), tmp_path / "out")
     assert result["status"] == "not_identifiable" and any("f[1] ended at a bound" in reason for reason in result["reasons"])
+
+
+def test_the_band_of_a_backbone_keeps_other_modes_out() -> None:
+    from types import SimpleNamespace
+
+    from bayes_nlsid.structure.modal import ModalModel
+    from bayes_nlsid.study.schema import PredictionEntry
+    from bayes_nlsid.study.stage_predict import _mode_band
+
+    model = ModalModel(2 * np.pi * np.array([9.0, 16.0, 400.0]), np.full(3, 0.01), ("tip",), np.ones((1, 3)))
+    context: Any = SimpleNamespace(model=model)
+    bands = [_mode_band(context, PredictionEntry("tip", 1e-3, mode)) for mode in (1, 2, 3)]
+    assert bands == [pytest.approx((4.5, 12.0)), pytest.approx((12.0, 25.6)), pytest.approx((200.0, 640.0))]
+    assert _mode_band(context, PredictionEntry("tip", 1e-3, band=(1.0, 2.0))) == (1.0, 2.0)

@@ -20,6 +20,8 @@ from bayes_nlsid.study.schema import PredictionEntry
 from bayes_nlsid.study.stage_identify import band_of, observed, stored_model
 
 LOOP_SAMPLES = 200
+AROUND = (0.5, 1.6)
+"""Band of the backbone of a mode, relative to its frequency, where the study states none."""
 Array = NDArray[np.float64]
 
 
@@ -66,12 +68,24 @@ def posterior_draws(context: Context, theta: Array, count: int, stage: str = "pr
 
 
 def _bands(context: Context, entry: PredictionEntry, model: Model, draws: Array) -> Bands:
+    band = _mode_band(context, entry) if model.linear.modes > 1 else entry.band
     try:
         return backbone_bands(draws, model, at=entry.at, start_amplitude=entry.amplitude, mode=entry.mode - 1,
                               amplitudes=entry.amplitudes or None, fs=entry.fs, scheme=entry.scheme, duration=entry.seconds,
-                              band=entry.band, seed=context.number("backbone"), progress=lambda sentence: context.progress(0.1, sentence))
+                              band=band, seed=context.number("backbone"), progress=lambda sentence: context.progress(0.1, sentence))
     except ValueError as error:
         raise InputError(f"{context.study.file.name}: [prediction]", str(error), "change at, amplitude, mode or fs") from None
+
+
+def _mode_band(context: Context, entry: PredictionEntry) -> tuple[float, float]:
+    """The stated band, or one about the mode that reaches no farther than half-way (in ratios) to its neighbours."""
+    if entry.band is not None:
+        return entry.band
+    f = context.model.frequency
+    k = min(entry.mode - 1, len(f) - 1)
+    low = max(AROUND[0] * f[k], np.sqrt(f[k] * f[k - 1]) if k else 0.0)
+    high = min(AROUND[1] * f[k], np.sqrt(f[k] * f[k + 1]) if k + 1 < len(f) else np.inf)
+    return float(low), float(high)
 
 
 def _band_arrays(bands: Bands) -> Arrays:
@@ -97,7 +111,7 @@ def _measured(context: Context, entry: PredictionEntry) -> Arrays:
     """The backbone read directly from a recorded decay."""
     assert entry.measured is not None
     time, displacement = _displacement(context, context.recordings[entry.measured], entry.at)
-    found = measured_backbone(time, displacement, entry.band or band_of(context, context.model), location=entry.at)
+    found = measured_backbone(time, displacement, _mode_band(context, entry), location=entry.at)
     if found.status != "ok":
         context.note(f"backbone measured from {entry.measured}: {found.status}")
     keep = np.isfinite(found.frequency) & np.isfinite(found.damping)
