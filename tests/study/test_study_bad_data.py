@@ -61,7 +61,7 @@ ARCHIVES: dict[str, tuple[tuple[str, str], dict[str, Any], list[str]]] = {
     "dead sensor": (("", ""), swap(acceleration=np.full(N, 3.0)), ["channel 'x'", "is constant at 3", "drop the channel"]),
     "rate is no number": (("", ""), swap(fs=np.array([FS, FS])), ["array 'fs'", "no sampling rate"]),
     "period does not fit": (('role = "train" ', 'role = "train"\nperiod = 1000 '), arrays(), ["not a whole number of periods of 1000"]),
-    "band beyond the rate": (('["5 Hz", "45 Hz"]', '["5 Hz", "900 Hz"]'), arrays(), ["[identification] band", "900 Hz", "1024 Hz"]),
+    "band beyond the rate": (('["5 Hz", "80 Hz"]', '["5 Hz", "900 Hz"]'), arrays(), ["[identification] band", "900 Hz", "1024 Hz"]),
     "rate that does not divide": (("starts = 20", "starts = 20\nrate = 30"), arrays(), ["[identification] rate", "a whole number"]),
     "settling longer than the record": (("starts = 20", "starts = 20\nsettle = 9"), arrays(), ["settle", "leave nothing"]),
     "negative settling": (("starts = 20", "starts = 20\nsettle = -1"), arrays(), ["settle", "negative"]),

@@ -46,7 +46,7 @@ CASES = {
     "free mode not among modes": ("free_modes = [1]", "free_modes = [2]", ["free_modes", "not among modes"]),
     "modes from zero": ("modes = [1] ", "modes = [0] ", ["modes", "from 1 up"]),
     "joint unknown": ('joints = ["x"]', 'joints = ["J1"]', ["joints", "'J1' is not a location"]),
-    "band backwards": ('band = ["5 Hz", "45 Hz"]', 'band = ["45 Hz", "5 Hz"]', ["band", "lower to a higher"]),
+    "band backwards": ('band = ["5 Hz", "80 Hz"]', 'band = ["80 Hz", "5 Hz"]', ["band", "lower to a higher"]),
     "no starts": ("starts = 20", "starts = 0", ["starts", "out of range"]),
     "one ensemble": ("ensembles = 4", "ensembles = 1", ["[posterior] ensembles", "out of range"]),
     "amplitude in hertz": ('amplitude = "2 mm"', 'amplitude = "2 Hz"', ["[prediction] amplitude", "Hz"]),

@@ -286,7 +286,7 @@ def _method(found: _Findings, where: dict[str, tuple[str, str]]) -> str:
     if peak is not None:
         low, high = 0.8 * peak[1], min(1.2 * peak[2], 0.45 * (first.rate or 0.0))
         lines.append(_line("band", f'["{max(low, 0.3 * peak[0]):.3g} Hz", "{max(high, 1.5 * peak[0]):.4g} Hz"]',
-                           "guess: where the strongest response has its power"))
+                           "guess: where its power lies; if no other mode is near, reach beyond three times the mode, for harmonics"))
     lines += [_line("joints", listed, "where force laws may act"), '# guess; see nlsid terms; "table1" is all of the published table',
               'candidates = ["cubic", "q|q|", "|q|v", "v|v|", "coulomb", "jenkins"]', _line("starts", "20"), "",
               "[posterior]", _line("ensembles", "4"), "", "[prediction]"]

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.identification.fit import Fit, Start, fit
+from bayes_nlsid.identification.harmonics import lost_motion
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.scenario import Scenario, scenario
 from bayes_nlsid.identification.select import Selection, select
@@ -143,9 +144,10 @@ def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData,
         raise
     except ValueError as error:
         raise InputError(f"{context.study.file.name}: [identification]", str(error), "change the candidates, joints or modes") from None
-    return _record(variant.name, found, linear, selection), {"theta": found.theta, "s": found.s, "covariance": found.covariance,
-                                                             "bounds": found.problem.bounds,
-                                                             "starts": np.array([x.theta for x in found.starts])}
+    lost = 0.0 if entry.output_error else lost_motion(found.problem, found.theta)
+    return _record(variant.name, found, linear, selection) | {"lost_motion": lost}, {
+        "theta": found.theta, "s": found.s, "covariance": found.covariance, "bounds": found.problem.bounds,
+        "starts": np.array([x.theta for x in found.starts])}
 
 
 def _candidates(context: Context, variant: AlternativeEntry, bare: Problem, entry: IdentificationEntry) -> list[Element]:

@@ -15,6 +15,9 @@ STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not con
 TOO_FEW = 0.75  # of the samples that a 90 % band should cover: fewer is no chance, the model is inadequate
 
 
+LOST = 1e-3     # share of motion above the band from which it is told; a cubic coefficient is then off by about 0.3 %
+
+
 def missed(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Held-out records of which far fewer than 90 % of the samples lie inside the 90 % band of the posterior."""
     if not any("identifiable" in p for p in result.get("parameters", [])):
@@ -46,7 +49,7 @@ def _covered(result: Mapping[str, Any]) -> str:
 
 def story(study: Study, result: Mapping[str, Any]) -> list[str]:
     """A handful of sentences, each from ``result.json`` alone."""
-    tellers = (_found, _against_alternatives, _sure, _backbone, _heldout, _inadequate)
+    tellers = (_found, _cut_off, _against_alternatives, _sure, _backbone, _heldout, _inadequate)
     out = [sentence for sentence in (tell(result) for tell in tellers) if sentence]
     out += list(study.report.notes)
     return [*out, _next(result)]
@@ -68,6 +71,17 @@ def _found(result: Mapping[str, Any]) -> str:
     way = f"{verb} chosen from the library" if chosen["forward"] else f"{verb} given as the form"
     left = f"; what is left is {score['mse'] / score['floor']:.3g} times what sensor noise alone would leave" if score.get("floor") else ""
     return f"{terms} {way}, removing {share:.1f} % of what the linear model leaves unexplained{left}."
+
+
+def _cut_off(result: Mapping[str, Any]) -> str:
+    """That the band took harmonics from the motion along which the laws were fitted."""
+    lost = (result.get("selection") or {}).get("lost_motion") or 0.0
+    if lost < LOST:
+        return ""
+    return (f"These laws make motion above the band that was looked at, {100 * lost:.2g} % of the motion in it, which the fit could not "
+            "see: their coefficients may be off by several times that share, and a law may have been taken on to make up for it. Let "
+            "[identification] band reach beyond three times the frequency of the main mode, as far as the sensors tell the modes there "
+            "apart.")
 
 
 def _against_alternatives(result: Mapping[str, Any]) -> str:

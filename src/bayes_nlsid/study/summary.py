@@ -91,6 +91,7 @@ def _selection(record: Mapping[str, Any]) -> dict[str, Any]:
     terms = [{"index": e["index"], "name": e["term"], "locations": e["locations"]} for e in record["elements"]]
     return {"forward": [label(e) for e in record.get("forward", [])], "backward": [label(e) for e in record.get("backward", [])],
             "terms": terms, "score": {"mse": record["mse"], "mse_linear": record["mse_linear"], "floor": record["floor"]},
+            "lost_motion": record.get("lost_motion", 0.0),
             "aliases": record.get("aliases", []), "status": record["status"]}
 
 
