@@ -124,6 +124,7 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     kinetic = np.einsum("mskh,h->msk", np.abs(motion) ** 2, h2)
     action = 0.5 * w * kinetic.sum(axis=0)
     linear = 2 * np.pi * w * np.einsum("sm,msk->sk", zeta * omega, kinetic)
+    memory = any(element.term.memory != "none" for element in model.elements)
     joints = np.pi * np.einsum("mskh,h->sk", (force * motion.conj()).imag, HARMONICS)
     loss = linear + joints
     rows = model.linear.rows((at,))[0]
@@ -138,7 +139,9 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
     good = status == "ok"
     if good.any():
         # loss over action is nearly flat, where loss alone grows like the square of the amplitude
-        curves = np.stack([w, np.log(action), loss / action, excess])[:, good]
+        viscous = (linear + (0.0 if memory else joints)) / action
+        turning = _turning(model, theta, motion, mode) if memory else ()
+        curves = np.stack([w, np.log(action), loss / action, excess, viscous, *turning])[:, good]
         finite = np.isfinite(curves).all(axis=(0, 1))
         spline = CubicSpline(log_a[finite], curves[:, :, finite], axis=2)
         # the peak is the prescribed amplitude times exp(excess): go back by that much along the curve
@@ -146,10 +149,30 @@ def _curves(model: Model, theta: Array, mode: int, at: str, log_a: Array, wanted
         back = value[3] / (1 + slope[3])
         value, slope = value - slope * back, slope - spline(wanted, 2) * back
         growth = slope[1] / (1 + slope[3])
-        rate = value[2] / (2 * np.pi) / growth
-        # zero crossings of a decay come at the damped frequency
-        out[0, good], out[1, good] = np.sqrt(np.maximum(value[0] ** 2 - rate**2, 0.0)) / (2 * np.pi), rate / value[0]
+        rate, slowing = value[2] / (2 * np.pi) / growth, value[4] / (2 * np.pi) / growth
+        if memory:
+            secant = value[0] ** 2 + 0.5 * value[0] * slope[0] / (1 + slope[3])
+            rate = rate * secant / (omega[good, mode, None] ** 2 + value[6] + value[5] + slope[5] / (1 + slope[3]))
+        # Zero crossings come later for what is lost in proportion to velocity; loops open towards the turning points and hardly delay them.
+        out[0, good], out[1, good] = np.sqrt(np.maximum(value[0] ** 2 - slowing**2, 0.0)) / (2 * np.pi), rate / value[0]
     return out[0], out[1], status
+
+
+def _turning(model: Model, theta: Array, motion: Complex, mode: int) -> tuple[Array, Array]:
+    """Forces (S, K) of elements with and without memory where the motion turns, in the equation of the mode, over its amplitude.
+
+    In a decay no loop closes. The branch that leaves the amplitude A ends at A' where the energy is used up: by Masing's rule
+    f(A) (A + A') = 4 Φ((A + A')/2), Φ the integral of the backbone f. To second order that is the loss of the closed loop at the
+    mean amplitude a over a f'(a), the slope of the backbone, where averaging has f(a).
+    """
+    joints = _Joints(model, theta)
+    at_joints = np.tensordot(joints.shapes, motion, axes=1).sum(axis=-1).real[..., None]
+    still, amplitude = np.zeros_like(at_joints[:1])[0], motion[mode, ..., 0].real
+    parts = [np.zeros(amplitude.shape), np.zeros(amplitude.shape)]
+    for r, term, p, spring in joints.entries:
+        force = term.law(at_joints[r], still, *p) - spring * at_joints[r]
+        parts[0 if term.memory == "masing" else 1] += joints.shapes[r, mode] * force[..., 0] / amplitude
+    return parts[0], parts[1]
 
 
 def _balance(model: Model, theta: Array, omega: Array, zeta: Array, mode: int, amplitude: Array) -> tuple[Complex, Array,
@@ -179,4 +202,6 @@ def _balance(model: Model, theta: Array, omega: Array, zeta: Array, mode: int, a
             h = HARMONICS * np.sqrt(square)[None, ..., None]
             motion = -force / (w2 - h**2 + 1j * c * h)
             motion[mode, ..., 0] = amplitude
+            if converged.all():
+                break
     return motion, square, converged, force
