@@ -129,6 +129,19 @@ def test_random_numbers_are_explicit(path: Path) -> None:
                 assert ALLOWED["emcee"].fullmatch(relative(path)), f"{relative(path)}: RandomState is for emcee only"
 
 
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_nothing_read_is_ever_executed(path: Path) -> None:
+    """No eval, exec or pickle of what a file holds; only workers unpickle, and only what their own parent sent them."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            assert called not in ("eval", "exec", "compile", "__import__", "builtins.eval", "builtins.exec"), f"line {node.lineno}"
+            assert not any(k.arg == "allow_pickle" and ast.unparse(k.value) != "False" for k in node.keywords), f"line {node.lineno}"
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
+        unsafe = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml"} & {str(name).partition(".")[0] for name in names}
+        assert not unsafe or relative(path) == "executors.py", unsafe
+
+
 def test_docs_name_every_room() -> None:
     assert {room_of(path) for path in MODULES} - {"__init__", "__main__"} <= set(rooms())
 
