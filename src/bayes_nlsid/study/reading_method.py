@@ -204,7 +204,8 @@ def read_posterior(table: Table | None) -> PosteriorEntry | None:
     priors = tuple(_read_prior(t) for t in table.tables("priors"))
     entry = PosteriorEntry(table.text("likelihood", "whittle", ("whittle", "plain")), table.integer("ensembles", 4, low=2),
                            table.integer("steps", None, low=10), table.integer("most", None, low=100),
-                           table.integer("walkers", None, low=4), priors)
+                           table.integer("walkers", None, low=4), priors,
+                           table.text("stage", None, ("regression", "forward", "both")))
     table.close()
     return entry
 

@@ -11,7 +11,7 @@ from bayes_nlsid.study import report_page as html
 from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent, places, unit_sign, with_sd
 from bayes_nlsid.study.pictures import Picture, idle
 from bayes_nlsid.study.progress import duration
-from bayes_nlsid.study.report_extras import response_section, scatter_section
+from bayes_nlsid.study.report_extras import response_section, scatter_section, stages_section
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
 from bayes_nlsid.study.story import sound, status_words, story
@@ -160,6 +160,7 @@ def _posterior(report: Report) -> str:
              ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"],
              ["stuck walkers", str(c["stuck_walkers"])]]
     out += html.table(["sampler", ""], facts, "stages/posterior")
+    out += stages_section(saved.data, parameters)
     priors = [[brief(p["parameter"]), brief(p["text"])] for p in saved.data.get("priors", [])]
     table = html.table(["parameter", "prior"], priors, "stages/posterior")
     return out + html.details("What was assumed beforehand (priors)", table)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayes_nlsid.study import report_page as html
-from bayes_nlsid.study.axes import digits_for, engineering
+from bayes_nlsid.study.axes import brief_names, digits_for, engineering
 from bayes_nlsid.study.store import Saved
 
 
@@ -95,4 +95,34 @@ def scatter_words(s: Mapping[str, Any]) -> list[str]:
     if not s["independent"]:
         out.append("Parameters of a posterior depend on each other: shares are those of a regression on the draws, and single parameters "
                    "are swung with all others at their medians.")
+    return out
+
+
+def stages_section(data: Mapping[str, Any], parameters: Sequence[Mapping[str, Any]]) -> str:
+    """Regression and simulation beside each other, and the tests of the simulated recordings."""
+    second = data.get("second_stage")
+    if not second:
+        return html.paragraph(f"Posterior of the {data.get('stage', 'regression')} alone: {data.get('stage_why', '')}.", "soft")
+    moved = {row["name"]: row for row in second.get("against_regression") or []}
+    rows = []
+    for p, name in zip(parameters, brief_names([p["name"] for p in parameters]), strict=True):
+        if "regression" not in p or p["name"] not in moved:
+            continue
+        r = p["regression"]
+        digits = digits_for(p["q05"], p["q95"])
+        rows.append([name, *(f"{engineering(x['q05'], p['unit'], digits)} – {engineering(x['q95'], p['unit'], digits)}" for x in (r, p)),
+                     f"{moved[p['name']]['shift_sd']:+.2g}", f"{moved[p['name']]['width_ratio']:.2g}"])
+    head = ["parameter", "regression, 5–95 %", "simulation, 5–95 %", "median moves (sd of regression)", "width over regression"]
+    out = html.table(head, rows, "stages/posterior", numeric=(1, 2, 3, 4)) if rows else ""
+    misfit = second.get("misfit")
+    if misfit:
+        ratio = "–" if misfit["innovation"] is None else f"{misfit['innovation']:.3g} (99.9 % limit {misfit['innovation_limit']:.3g})"
+        facts = [["error variance over measured sensor noise", ratio],
+                 ["log of unmeasured force over sensor noise (limit 3)", f"{misfit['log_unmeasured_force']:.2g}"],
+                 *([f"score of {s['force']} (limit 4)", f"{s['z']:+.2g}"] for s in misfit["scores"][:3])]
+        out += html.table(["does the model explain the recordings?", "no" if misfit["found"] else "yes"], facts, "stages/posterior")
+        out += html.listing([*misfit["reasons"], *misfit["notes"]])
+    if "k_hat" in second:
+        out += html.paragraph(f"{second['simulated']} draws were simulated and weighted; k-hat {second['k_hat']:.2f} (limit 0.7), "
+                              f"{second['effective']:.0f} effective.", "soft")
     return out

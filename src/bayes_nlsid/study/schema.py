@@ -162,7 +162,11 @@ class PriorEntry:
 @final
 @dataclass(frozen=True)
 class PosteriorEntry:
-    """``[posterior]``: ``steps`` after burn-in, or None to go on until converged; ``most`` limits them, burn-in included."""
+    """``[posterior]``: ``steps`` after burn-in, or None to go on until converged; ``most`` limits them, burn-in included.
+
+    ``stage``: the residual of Eq. 13 ("regression"), the measured channels through simulation ("forward"), or one after the other
+    ("both"); None takes both where the recordings are short enough.
+    """
 
     likelihood: str = "whittle"
     ensembles: int = 4
@@ -170,6 +174,7 @@ class PosteriorEntry:
     most: int | None = None
     walkers: int | None = None
     priors: tuple[PriorEntry, ...] = ()
+    stage: Literal["regression", "forward", "both"] | None = None
 
 
 @final

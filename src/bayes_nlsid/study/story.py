@@ -9,9 +9,10 @@ from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, 
 from bayes_nlsid.study.schema import Study
 
 STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not converged", "not_identifiable": "refused: not identifiable",
-                "failed": "refused: the computation failed"}
+                "model_misfit": "refused: the model does not explain the recordings", "failed": "refused: the computation failed"}
 
 
+DISAGREE = 2.0  # standard deviations of the regression by which the second stage may move a parameter without a word
 TOO_FEW = 0.75  # of the samples that a 90 % band should cover: fewer is no chance, the model is inadequate
 
 
@@ -49,7 +50,7 @@ def _covered(result: Mapping[str, Any]) -> str:
 
 def story(study: Study, result: Mapping[str, Any]) -> list[str]:
     """A handful of sentences, each from ``result.json`` alone."""
-    tellers = (_found, _cut_off, _against_alternatives, _sure, _backbone, _heldout, _inadequate)
+    tellers = (_found, _cut_off, _against_alternatives, _sure, _two_stages, _backbone, _heldout, _inadequate)
     out = [sentence for sentence in (tell(result) for tell in tellers) if sentence]
     out += list(study.report.notes)
     return [*out, _next(result)]
@@ -132,8 +133,30 @@ def _heldout(result: Mapping[str, Any]) -> str:
     return f"{said}, and {100 * h['coverage90']:.0f} % of the samples lie inside the 90 % band."
 
 
+def _two_stages(result: Mapping[str, Any]) -> str:
+    """Whether the posterior by simulation agrees with that of the regression, and what a difference says."""
+    second = (result.get("posterior") or {}).get("second_stage")
+    if not second:
+        return ""
+    if second["status"] != "ok":
+        return f"The posterior by simulation of the recordings is not to be trusted ({'; '.join(second['reasons'][:1])})."
+    rows = second.get("against_regression") or []
+    if not rows:
+        return "The posterior comes from simulating the recordings."
+    far = [r for r in rows if abs(r["shift_sd"]) > DISAGREE]
+    if not far:
+        return "Simulating the recordings instead of regressing on them moves no parameter beyond the uncertainty of the regression."
+    names = ", ".join(f"{brief(r['name'])} by {abs(r['shift_sd']):.2g}" for r in sorted(far, key=lambda r: -abs(r["shift_sd"]))[:3])
+    return (f"Simulating the recordings instead of regressing on them moves {names} standard deviations of the regression: noise in the "
+            "measured motion, or modes that the model leaves out, bias the regression; the values given are those of the simulation.")
+
+
 def _inadequate(result: Mapping[str, Any]) -> str:
     """That intervals of a model which its own test contradicts are conditional on that model."""
+    if result["status"] == "model_misfit":
+        why = "; ".join(result["posterior"]["second_stage"]["misfit"]["reasons"][:2])
+        return (f"All intervals given here are conditional on an inadequate model: {why}. They tell how closely the recordings fix the "
+                "parameters of this model, not how far it is from the structure.")
     if result["status"] == "failed" or not missed(result):
         return ""
     worst = min(missed(result), key=lambda e: float(e["coverage90"]))
@@ -153,6 +176,8 @@ def _next(result: Mapping[str, Any]) -> str:
         return "Next: do not use the intervals yet; raise steps under [posterior] and run again, the sampler goes on from where it stopped."
     if status == "not_identifiable":
         return "Next: record larger amplitudes, or tie the joints' parameters, before trusting any value of the nonlinear part."
+    if status == "model_misfit":
+        return "Next: something is missing in the model; find it with nlsid diagnose, or add force laws or modes, and run again."
     b = result.get("backbone") or {}
     if missed(result):
         return ("Next: the band is too narrow on records it has not seen, so something is missing in the model; find it with nlsid "

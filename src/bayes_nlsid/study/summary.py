@@ -14,14 +14,15 @@ from bayes_nlsid.study.store import Saved, versions
 
 AT_BOUND = 1e-3
 """Share of its range within which a value counts as lying at the end of it."""
-STATUSES = ("ok", "not_converged", "not_identifiable", "failed")
+STATUSES = ("ok", "not_converged", "not_identifiable", "model_misfit", "failed")
 
 
 def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, Any]:
     """Everything a program outside needs to know of a run.
 
     ``status``: ``failed`` if the fit or the prediction could not be computed, ``not_converged`` if the sampler is not to be
-    trusted, ``not_identifiable`` if the recordings narrow none of the nonlinear parameters, else ``ok``.
+    trusted, ``not_identifiable`` if the recordings narrow none of the nonlinear parameters,
+    ``model_misfit`` if the simulated recordings differ from the measured ones by more than noise, else ``ok``.
     """
     status, reasons = _verdict(done)
     out: dict[str, Any] = {
@@ -37,6 +38,7 @@ def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, A
         out["parameters"] = _parameters(done)
     if "posterior" in done:
         out["convergence"] = done["posterior"].data["convergence"]
+        out["posterior"] = {key: done["posterior"].data.get(key) for key in ("stage", "stage_why", "likelihood", "second_stage")}
     if "predict" in done:
         out["heldout"] = _heldout(done["predict"])
         out["backbone"] = done["predict"].data.get("backbone", {})
@@ -69,10 +71,25 @@ def _verdict(done: Mapping[str, Saved]) -> tuple[str, list[str]]:
         elif flags and not any(flags):
             status = "not_identifiable"
             reasons.append("the recordings narrow none of the nonlinear parameters beyond what was assumed")
+        status = _second(data, status, reasons)
     if "predict" in done and done["predict"].data.get("status", "ok") != "ok":
         reasons.append(done["predict"].data["status"])
         status = "failed" if status == "ok" and done["predict"].data.get("all_failed", False) else status
     return status, list(dict.fromkeys(reasons))
+
+
+def _second(data: Mapping[str, Any], status: str, reasons: list[str]) -> str:
+    """What the stage by simulation changes: one that was asked for and is not to be trusted, a model that its errors contradict."""
+    second = data.get("second_stage")
+    if not second:
+        return status
+    if second["status"] in ("failed", "not_converged") and data["stage_why"] == "as the study says":
+        reasons += second["reasons"]
+        status = "not_converged"
+    if second["misfit"] and second["misfit"]["found"]:
+        reasons += second["misfit"]["reasons"]
+        status = "model_misfit" if status == "ok" else status
+    return status
 
 
 def _astray(done: Mapping[str, Saved]) -> list[str]:
@@ -107,6 +124,10 @@ def _parameters(done: Mapping[str, Saved]) -> list[dict[str, Any]]:
             row |= {"q05": float(quantiles[0, i]), "q50": float(quantiles[1, i]), "q95": float(quantiles[2, i]),
                     "identifiable": bool(saved.data["identifiable"][i]), "narrowing": float(saved.arrays["narrowing"][i]),
                     "ess": float(saved.arrays["ess"][i]), "tau": float(saved.arrays["tau"][i])}
+        if "regression_quantiles" in saved.arrays:
+            for i, row in enumerate(rows):
+                low, middle, high = (float(x) for x in saved.arrays["regression_quantiles"][:, i])
+                row["regression"] = {"q05": low, "q50": middle, "q95": high}
     return rows
 
 

@@ -93,6 +93,7 @@ starts = 20
 # params = { c = ["N/m^3", "coefficient"] }
 
 [posterior]
+# stage = "both"                  # "regression" (Eq. 13), "forward" (recordings simulated), or both; by default both where that is quick
 ensembles = 4                     # independent ensembles of walkers; they go on until converged (or steps = ..., most = ...)
 
 [prediction]
