@@ -49,7 +49,9 @@ def test_a_model_that_lacks_the_force_is_refused(small: Path, tmp_path: Path) ->
 
 
 def test_regression_alone_where_asked_and_words_that_are_none(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, result = run(small, tmp_path / "alone", 'stage = "regression"\nmost = 200\n', candidates='["cubic"]')
+    code, result = run(small, tmp_path / "alone", 'stage = "regression"\n', candidates='["cubic"]')
     assert code in (0, 1) and result["posterior"]["second_stage"] is None
+    assert run(small, tmp_path / "few", 'stage = "regression"\nmost = 200\n', candidates='["cubic"]')[0] == 2
+    assert "most" in capsys.readouterr().err
     assert run(small, tmp_path / "wrong", 'stage = "forwards"\n')[0] == 2
     assert "forward" in capsys.readouterr().err

@@ -65,6 +65,9 @@ def posterior(context: Context) -> Result:
             raise InputError(f"{context.study.file.name}: [posterior] stage", "; ".join(data["second_stage"]["reasons"]),
                              'write stage = "regression"')
     assert found is not None
+    if not len(found.flat):
+        raise InputError(f"{context.study.file.name}: [posterior] most", f"the sampler left no draws ({'; '.join(found.reasons)})",
+                         "raise most, or leave it out")
     rng = np.random.default_rng(context.random("prior"))
     arrays["prior_draws"] = np.stack([p.sample(PRIOR_DRAWS, rng) for p in priors], axis=1)
     _keep_whole(context, found, likelihood, arrays)
