@@ -47,7 +47,7 @@ def test_help_is_quick() -> None:
     (["run", "nowhere.toml", "--out", "x"], 2, "there is no such file"),
     (["check", "nowhere.toml"], 2, "there is no such file"),
     (["report", "nowhere"], 2, "there is no such folder"),
-    (["compare", "s.toml", "--out", "x"], 2, "not part of version"),
+    (["compare", "s.toml", "--out", "x"], 2, "s.toml"),
     (["montecarlo", "s.toml", "--out", "x"], 2, "there is no such file"),
     (["frf", "s.toml", "--out", "x"], 2, "there is no such file"),
 ])

@@ -12,9 +12,6 @@ from bayes_nlsid import __version__
 from bayes_nlsid.errors import InputError
 
 DONE, REFUSED, BAD_INPUT, STOPPED = 0, 1, 2, 130
-_ABSENT = {
-    "compare": "the comparison of scenarios",
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,9 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("study", metavar="STUDY.toml")
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
     diagnose.add_argument("study", metavar="PATH", help="case folder")
-    for name, what in (("compare", "scenarios S1–S3 or named alternatives on a common held-out target"),):
-        add(name, f"{what} (not in this version)", _absent, out=True).add_argument("study", metavar="STUDY.toml")
-    for name, what in (("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
+    for name, what in (("compare", "scenarios S1–S3 and alternatives scored on records that none of them was fitted to"),
+                       ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
                        ("frf", "stepped-sine response curves with posterior bands")):
         extra = add(name, f"{what}; the run comes first where it is missing", _extra, out=True)
         extra.add_argument("study", metavar="STUDY.toml")
@@ -237,14 +233,5 @@ def _hypotheses(options: argparse.Namespace) -> int:
 
     print(hypotheses_table())
     return DONE
-
-
-def _absent(options: argparse.Namespace) -> int:
-    return _not_here(options, _ABSENT[options.command])
-
-
-def _not_here(options: argparse.Namespace, what: str) -> int:
-    print(f"nlsid {options.command}: {what} is not part of version {__version__}.", file=sys.stderr)
-    return BAD_INPUT
 
 

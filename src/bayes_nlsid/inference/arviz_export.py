@@ -98,6 +98,26 @@ def pareto_smoothed(log_weights: NDArray[np.float64]) -> tuple[NDArray[np.float6
     return out, float(shape)
 
 
+def comparison_bytes(names: tuple[str, ...], theta: NDArray[np.float64], log_density: NDArray[np.float64], blocks: tuple[str, ...],
+                     title: str) -> bytes:
+    """One alternative of a comparison as InferenceData in netCDF: draws (S, P) and log density (S, B) of held-out blocks.
+
+    The densities are of data that were not fitted: their log mean over draws is the score, and no leave-one-out is due.
+    """
+    from tempfile import TemporaryDirectory
+
+    with _quiet():
+        import arviz
+        import xarray
+
+        draws = xarray.Dataset({name: (("chain", "draw"), theta[None, :, i]) for i, name in enumerate(names)})
+        scores = xarray.Dataset({"heldout": (("chain", "draw", "block"), log_density[None])}, coords={"block": list(blocks)})
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "one.nc"
+            write_netcdf(arviz.InferenceData(attrs={"alternative": title}, posterior=draws, log_likelihood=scores), path)
+            return path.read_bytes()
+
+
 def write_netcdf(data: Any, path: Path | str) -> None:
     """Write InferenceData to netCDF with h5netcdf, at once or not at all."""
     target = Path(path)

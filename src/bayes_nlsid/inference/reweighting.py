@@ -23,7 +23,7 @@ from bayes_nlsid.inference.arviz_export import pareto_smoothed
 from bayes_nlsid.inference.convergence import LEAST_ESS, Convergence
 from bayes_nlsid.inference.ensemble import MOST_STEPS, sample
 from bayes_nlsid.inference.forward import ForwardLikelihood
-from bayes_nlsid.inference.likelihood import Likelihood
+from bayes_nlsid.inference.likelihood import Likelihood, WhittleLikelihood, laplace
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, log_prior
 from bayes_nlsid.inference.target import Target
@@ -94,6 +94,21 @@ def around_optimum(likelihood: ForwardLikelihood, priors: Sequence[Prior], draws
     with np.errstate(invalid="ignore"):
         weights, shape = pareto_smoothed(np.where(inside & np.isfinite(value), value + prior - proposal, -np.inf))
     return Weighted(theta, weights, value, shape)
+
+
+def around_fit(likelihood: WhittleLikelihood, priors: Sequence[Prior], draws: int = 1000, seed: int = 0) -> Weighted:
+    """The same for the regression's likelihood, around its own fit."""
+    rng = np.random.default_rng(seed)
+    target = Target(likelihood, tuple(priors))
+    size, centre = len(priors), np.clip(target.to_s(likelihood.fit.theta), *target.box)
+    root = np.linalg.cholesky(laplace(likelihood, likelihood.fit.theta, target.prior_sd, target.coordinates)
+                              + 1e-12 * np.diag(target.prior_sd**2)) * WIDEN
+    z = rng.standard_normal((draws, size)) / np.sqrt(rng.chisquare(FREEDOM, size=(draws, 1)) / FREEDOM)
+    s = centre + z @ root.T
+    value = target(s)
+    with np.errstate(invalid="ignore"):
+        weights, shape = pareto_smoothed(value + 0.5 * (FREEDOM + size) * np.log1p(np.sum(z**2, axis=1) / FREEDOM))
+    return Weighted(target.to_theta(np.clip(s, *target.box)), weights, value, shape)
 
 
 @final

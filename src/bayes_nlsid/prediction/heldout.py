@@ -85,6 +85,53 @@ class Heldout:
                 raise ValueError(f"heldout: {name} has shape {getattr(self, name).shape}, expected {self.measured.shape}")
 
 
+@final
+@dataclass(frozen=True)
+class Replayed:
+    """Draws simulated on one recording, each from its own start.
+
+    Parameters
+    ----------
+    values : ndarray (S, n, s)
+        In the units of the channels, not band-passed.
+    status : ndarray of str (S,)
+    scored : slice
+        Samples behind the part that an unknown start was estimated from.
+    start : {"rest", "estimate", "steady"}
+    numerical_error : float
+    """
+
+    values: Array
+    status: NDArray[np.str_]
+    scored: slice
+    start: str
+    numerical_error: float
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(S,) which draws can be used."""
+        return np.asarray(self.status == "ok")
+
+
+def replayed(model: Model, theta: Array, recording: Recording, *, band: tuple[float, float] | None, noise: NoiseFloor,
+             start: Start | None = None, seed: int = 0, scheme: SchemeName = "exponential", tolerance: float | None = None,
+             compiled: bool | None = None, progress: Callable[[str], None] | None = None) -> Replayed:
+    """Simulate a recording for draws theta (S, P), the start estimated where it is not known; parameters as in ``heldout``."""
+    if tolerance is None:
+        level = np.sqrt(np.mean(np.square(recording.response), axis=0))
+        tolerance = float(np.clip(0.2 * np.min(noise.rms() / np.maximum(level, 1e-300)), 2e-5, 1e-3))
+    first = _start_samples(model, recording, band)
+    steady = recording.period is not None and not recording.free
+    how = "steady" if steady else start or _usual_start(recording, first)
+    keywords: dict[str, object] = {"scheme": scheme, "tolerance": tolerance, "compiled": compiled, "progress": progress}
+    u0 = v0 = None
+    if how == "estimate":
+        sigma = float(np.median(noise.rms() / np.maximum(np.sqrt(np.mean(np.square(recording.response[:first]), axis=0)), 1e-300)))
+        u0, v0 = _initial_state(model, theta, recording, band, first, keywords, sigma, seed)
+    found: Replay = predict_record(model, theta, recording, u0=u0, v0=v0, **keywords)  # type: ignore[arg-type]
+    return Replayed(found.values, found.status, slice(first if how == "estimate" else 0, recording.n), how, found.numerical_error)
+
+
 def heldout(model: Model, draws: ArrayLike | Drawable, recording: Recording, *, band: tuple[float, float] | None = None,
             noise: NoiseFloor | None = None, start: Start | None = None, samples: int = 100, seed: int = 0,
             scheme: SchemeName = "exponential",
@@ -124,27 +171,17 @@ def heldout(model: Model, draws: ArrayLike | Drawable, recording: Recording, *, 
     theta = np.atleast_2d(draws.draws(samples, seed) if isinstance(draws, Drawable) else np.asarray(draws, dtype=float))
     floor = noise if noise is not None else noise_psd(recording)
     noise_rms = floor.rms(None if band is None else band)
-    if tolerance is None:
-        level = np.sqrt(np.mean(np.square(recording.response), axis=0))
-        tolerance = float(np.clip(0.2 * np.min(floor.rms() / np.maximum(level, 1e-300)), 2e-5, 1e-3))
-    first = _start_samples(model, recording, band)
-    steady = recording.period is not None and not recording.free
-    how = "steady" if steady else start or _usual_start(recording, first)
-    keywords: dict[str, object] = {"scheme": scheme, "tolerance": tolerance, "compiled": compiled, "progress": progress}
-    u0 = v0 = None
-    if how == "estimate":
-        sigma = float(np.median(floor.rms() / np.maximum(np.sqrt(np.mean(np.square(recording.response[:first]), axis=0)), 1e-300)))
-        u0, v0 = _initial_state(model, theta, recording, band, first, keywords, sigma, seed)
-    found: Replay = predict_record(model, theta, recording, u0=u0, v0=v0, **keywords)  # type: ignore[arg-type]
+    found = replayed(model, theta, recording, band=band, noise=floor, start=start, seed=seed, scheme=scheme, tolerance=tolerance,
+                     compiled=compiled, progress=progress)
     measured = _inside(recording.response, recording, band)
     counts = {str(s): int((found.status == s).sum()) for s in np.unique(found.status)}
-    scored = slice(first if how == "estimate" else 0, recording.n)
+    scored = found.scored
     quantiles = _predictive(found.values[found.ok], recording, band, noise_rms)
     rmse, nrmse, noise_floor = _scores(measured[scored], quantiles[1][scored], noise_rms, recording)
     inside = (measured >= quantiles[0]) & (measured <= quantiles[2])
     coverage = float(inside[scored].mean()) if found.ok.any() else float("nan")
-    return Heldout(recording.name, recording.time, measured, *quantiles, nrmse, noise_floor, coverage, rmse, noise_rms, scored, how, counts,
-                   found.numerical_error)
+    return Heldout(recording.name, recording.time, measured, *quantiles, nrmse, noise_floor, coverage, rmse, noise_rms, scored, found.start,
+                   counts,found.numerical_error)
 
 
 def _start_samples(model: Model, recording: Recording, band: tuple[float, float] | None) -> int:

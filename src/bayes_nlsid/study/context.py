@@ -150,7 +150,7 @@ class Context:
         tables: dict[str, tuple[Any, ...]] = {
             "read": (), "linear": (study.structure, study.reduction, study.linear), "identify": (study.identification, *study.terms),
             "posterior": (study.posterior,), "predict": (study.prediction,), "frf": (study.frf,),
-            "montecarlo": (study.montecarlo, study.prediction)}
+            "montecarlo": (study.montecarlo, study.prediction), "compare": (study.compare,)}
         out: dict[str, Any] = {
             "tables": digest([None if t is None else _plain(asdict(t)) for t in tables[stage]]), "code": code_digest(stage),
             "versions": {name: value for name, value in versions().items() if name in _NUMERICAL},

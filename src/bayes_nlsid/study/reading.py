@@ -10,7 +10,7 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
 from bayes_nlsid.recordings.units import unit_factor
-from bayes_nlsid.study.reading_extras import read_frf, read_montecarlo
+from bayes_nlsid.study.reading_extras import read_compare, read_frf, read_montecarlo
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
 from bayes_nlsid.study.reading_plan import read_plan
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
@@ -66,6 +66,7 @@ def read_study(path: Path | str) -> Study:
     report = read_report(top.table("report"))
     frf = read_frf(top.table("frf"), locations)
     scatter = top.table("montecarlo")
+    compared = read_compare(top.table("compare"), identification is not None)
     top.close()
     montecarlo = read_montecarlo(scatter, locations, prediction, posterior is not None)
     later = {"posterior": posterior, "prediction": prediction, "frf": frf, "montecarlo": montecarlo}
@@ -74,7 +75,7 @@ def read_study(path: Path | str) -> Study:
     files = dict.fromkeys([*(p for _, p in structure.files), *others, *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
     return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
-                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan)
+                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan, compared)
 
 
 def _parse(file: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bayes_nlsid.study.schema import FrfEntry, MonteCarloEntry, PredictionEntry, SpreadEntry
+from bayes_nlsid.study.schema import CompareEntry, FrfEntry, MonteCarloEntry, PredictionEntry, SpreadEntry
 from bayes_nlsid.study.table import Table, nearest
 
 MOST_SAMPLES = 2**22
@@ -23,6 +23,21 @@ def read_frf(table: Table | None, locations: Sequence[str]) -> FrfEntry | None:
         raise table.wrong("band", "begins at zero", 'write band = ["15 Hz", "25 Hz"]')
     entry = FrfEntry(drive, at, tuple(sorted(levels)), band, table.integer("harmonics", None, low=1, high=63),
                      table.integer("samples", 100, low=2))
+    table.close()
+    return entry
+
+
+def read_compare(table: Table | None, identified: bool) -> CompareEntry | None:
+    """``[compare]``; without it the three scenarios are compared, and nothing where nothing is identified."""
+    if table is None:
+        return CompareEntry() if identified else None
+    if not identified:
+        raise table.wrong("scenarios", "compares what is not identified", "add [identification]")
+    scenarios = table.texts("scenarios", ("S1", "S2", "S3"))
+    wrong = [s for s in scenarios if s not in ("S1", "S2", "S3")]
+    if wrong or not scenarios or len(set(scenarios)) != len(scenarios):
+        raise table.wrong("scenarios", f"{list(scenarios)} are not different names among S1, S2, S3", 'write scenarios = ["S1", "S2"]')
+    entry = CompareEntry(tuple(scenarios), table.integer("samples", 100, low=20, high=5000))
     table.close()
     return entry
 

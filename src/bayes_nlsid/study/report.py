@@ -11,7 +11,7 @@ from bayes_nlsid.study import report_page as html
 from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent, places, unit_sign, with_sd
 from bayes_nlsid.study.pictures import Picture, idle
 from bayes_nlsid.study.progress import duration
-from bayes_nlsid.study.report_extras import response_section, scatter_section, stages_section
+from bayes_nlsid.study.report_extras import comparison_section, response_section, scatter_section, stages_section
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.store import Saved
 from bayes_nlsid.study.story import sound, status_words, story
@@ -46,6 +46,7 @@ def render(report: Report) -> str:
     sections: list[tuple[str, str, Callable[[Report], str]]] = [
         ("recordings", "Recordings", _recordings), ("linear", "Linear model", _linear), ("selection", "Which force laws", _selection),
         ("posterior", "Parameters and their uncertainty", _posterior), ("prediction", "What the model predicts", _prediction),
+        ("compare", "Alternatives compared", lambda r: comparison_section(r.done)),
         ("frf", "Response to stepped sines", lambda r: response_section(r.done)),
         ("montecarlo", "Scatter and what it comes from", lambda r: scatter_section(r.done)),
         ("provenance", "Where every number comes from", _provenance)]

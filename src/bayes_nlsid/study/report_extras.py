@@ -98,6 +98,30 @@ def scatter_words(s: Mapping[str, Any]) -> list[str]:
     return out
 
 
+def comparison_section(done: Mapping[str, Saved]) -> str:
+    """The sentence and one row for each alternative."""
+    saved = done.get("compare")
+    if saved is None:
+        return ""
+    s = saved.data["summary"]
+    head = ["alternative", "log density against the best", "standard error", "stacking weight", "error on held-out records",
+            "discrepancy learnt", "k-hat"]
+    out = html.table(head, comparison_rows(s), f"stages/compare, compare.json; {', '.join(s['records'])}", numeric=(1, 2, 3, 4, 5, 6))
+    note = ("Every alternative is simulated on the same held-out records and scored block by block; its own discrepancy, learnt on the "
+            "records it was fitted to, is part of its prediction.")
+    return html.paragraph(s["sentence"]) + out + html.paragraph(note, "soft") + html.listing(s["reasons"])
+
+
+def comparison_rows(summary: Mapping[str, Any]) -> list[list[str]]:
+    """Best first."""
+    def number(value: Any, form: str) -> str:
+        return "–" if value is None or value != value or abs(value) == float("inf") else format(value, form)
+
+    return [[r["name"], number(r["elpd_difference"], "+.1f"), number(r["elpd_se"], ".1f"), number(r["stacking_weight"], ".2f"),
+             number(100 * r["nrmse"], ".3g") + " %", number(100 * r["discrepancy"], ".2g") + " %", number(r["k_hat"], ".2f")]
+            for r in summary["alternatives"]]
+
+
 def stages_section(data: Mapping[str, Any], parameters: Sequence[Mapping[str, Any]]) -> str:
     """Regression and simulation beside each other, and the tests of the simulated recordings."""
     second = data.get("second_stage")

@@ -22,7 +22,8 @@ from bayes_nlsid.study.summary import summarise, to_text
 
 # a stage is a pure function of the context: what it returns is stored, and stored results are all that later stages see
 _STAGES = {stage: (f"bayes_nlsid.study.stage_{stage}", stage) for stage in (*STAGES, *EXTRAS) if stage != "report"}
-_NEEDED = {"frf": "input, output, levels and band", "montecarlo": 'source = "posterior", or source = "fit" and scatter = "5 %"'}
+_NEEDED = {"frf": "input, output, levels and band", "montecarlo": 'source = "posterior", or source = "fit" and scatter = "5 %"',
+           "compare": "an [identification] to compare"}
 
 
 def _stage(name: str) -> Callable[[Context], Result]:
@@ -50,7 +51,8 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
     fresh : bool
         Compute everything again; with ``extra``, that alone.
     extra : str, optional
-        A stage beside the run, "frf" or "montecarlo", computed from the finished run, which is taken from disk where it is there.
+        A stage beside the run, "frf", "montecarlo" or "compare", computed from the finished run, which is taken from
+        disk where it is there.
     reporter : Reporter, optional
 
     Returns
@@ -156,7 +158,10 @@ def finish(store: Store, study: Study, done: dict[str, Saved], seed: int, told: 
         _write_backbone(done["predict"], store.out / "backbone.npz")
     for name in EXTRAS:
         if name in done:
-            write_atomic(store.out / f"{name}.npz", npz(done[name].arrays))
+            arrays = done[name].arrays
+            write_atomic(store.out / f"{name}.npz", npz({key: a for key, a in arrays.items() if not key.startswith("netcdf")}))
+            for key in (key for key in arrays if key.startswith("netcdf")):
+                write_atomic(store.out / f"{name}_{key.removeprefix('netcdf')}.nc", arrays[key].tobytes())
             write_atomic(store.out / f"{name}.json", to_text({key: result[key] for key in ("format", "title", "seed", "versions", "inputs")}
                                                              | result[name]).encode())
     pictures = draw_all(study, done, told.update if told is not None else None)

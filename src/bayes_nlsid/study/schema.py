@@ -10,7 +10,7 @@ from bayes_nlsid.recordings.reading import RecordingSpec
 
 StructureKind = Literal["beam", "matrices", "oscillator"]
 STAGES = ("read", "linear", "identify", "posterior", "predict", "report")
-EXTRAS = ("frf", "montecarlo")
+EXTRAS = ("frf", "montecarlo", "compare")
 """Stages with commands of their own, computed from a finished run."""
 
 
@@ -206,6 +206,15 @@ class PredictionEntry:
 
 @final
 @dataclass(frozen=True)
+class CompareEntry:
+    """``[compare]``: which scenarios the main form is fitted in, and the number of posterior draws of each alternative."""
+
+    scenarios: tuple[str, ...] = ("S1", "S2", "S3")
+    samples: int = 100
+
+
+@final
+@dataclass(frozen=True)
 class FrfEntry:
     """``[frf]``: stepped-sine response curves of ``nlsid frf``.
 
@@ -325,7 +334,7 @@ class Study:
     linear : LinearEntry
     identification, posterior, prediction : entries or None
         A stage whose table is missing is not run.
-    frf, montecarlo : entries or None
+    frf, montecarlo, compare : entries or None
         What the commands of these names compute.
     terms : tuple of UserTermEntry
     report : ReportEntry
@@ -352,6 +361,7 @@ class Study:
     locations: tuple[str, ...] = ()
     inputs: tuple[tuple[str, str], ...] = ()
     plan: PlanEntry | None = None
+    compare: CompareEntry | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
 
 def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
     """One screen for a command beside the run."""
-    from bayes_nlsid.study.report_extras import response_rows, scatter_words, share_cells
+    from bayes_nlsid.study.report_extras import comparison_rows, response_rows, scatter_words, share_cells
 
     found = result[name]
     parts = [f"{result['title']}: {'done' if found['status'] == 'ok' else found['status']}"]
@@ -74,6 +74,10 @@ def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
             rows = [[n, *share_cells(r)] for n, r in zip(brief_names([r["name"] for r in ranked]), ranked, strict=True)][:8]
             parts.append("\n" + columns([f"scatter of {what} at {at}", "first order", "90 %", "total", "90 %"], rows, right=(1, 2, 3, 4)))
         return "\n".join([*parts, f"\nin {out}: report.html, montecarlo.npz, montecarlo.json, figures/"])
+    if name == "compare":
+        head = ["alternative", "log density", "se", "weight", "error", "discrepancy", "k-hat"]
+        parts.append("\n" + columns(head, comparison_rows(found), right=(1, 2, 3, 4, 5, 6)) + "\n\n" + _wrapped(found["sentence"]))
+        return "\n".join([*parts, f"\nin {out}: report.html, compare.json, compare.npz, compare_<k>.nc"])
     head = ["force", "peak (Hz)", "5-95 %", f"amplitude at {found['output']}", "5-95 %", "harmonics"]
     parts.append("\n" + columns(head, response_rows(found), right=(0, 1, 2, 3, 4, 5)))
     return "\n".join([*parts, f"\nin {out}: report.html, {name}.npz, result.json, figures/"])

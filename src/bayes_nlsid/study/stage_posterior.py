@@ -46,7 +46,7 @@ def posterior(context: Context) -> Result:
     if not start.problem.size or not start.problem.names:
         return {"theta": np.zeros((1, 0, 1, 0)), "log_prob": np.zeros((1, 0, 1)), "quantiles": np.zeros((3, 0)), "narrowing": np.zeros(0),
                 "ess": np.zeros(0), "tau": np.zeros(0)}, _empty()
-    priors = _priors(context, entry, start)
+    priors = chosen_priors(context, start)
     stage, why = chosen_stage(context, entry, start)
     found: Posterior | None = None
     arrays: dict[str, Any] = {}
@@ -159,8 +159,8 @@ def _likelihood(entry: PosteriorEntry, start: Fit) -> Likelihood:
     return WhittleLikelihood(start) if entry.likelihood == "whittle" else PlainLikelihood(start)
 
 
-def _priors(context: Context, entry: PosteriorEntry, start: Fit) -> tuple[Prior, ...]:
-    """The default priors with those of the study in their place.
+def chosen_priors(context: Context, start: Fit, strict: bool = True) -> tuple[Prior, ...]:
+    """The default priors with those of the study in their place; ``strict``: every one of the study must name a parameter.
 
     Raises
     ------
@@ -168,10 +168,10 @@ def _priors(context: Context, entry: PosteriorEntry, start: Fit) -> tuple[Prior,
         If a pattern names no parameter, or a prior does not fit its bounds.
     """
     out = list(default_priors(start.problem))
-    for i, stated in enumerate(entry.priors):
+    for i, stated in enumerate(context.study.posterior.priors if context.study.posterior is not None else ()):
         where = f"{context.study.file.name}: [[posterior.priors]] {i + 1}"
         matched = [k for k, p in enumerate(out) if p.name == stated.parameter or fnmatchcase(p.name, stated.parameter.replace("[", "[[]"))]
-        if not matched:
+        if not matched and strict:
             raise InputError(where, f"{stated.parameter!r} is none of the parameters {', '.join(p.name for p in out[:8])}",
                              "correct the name")
         for k in matched:
