@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from bayes_nlsid.model import Model
+from bayes_nlsid.prediction import stability
 from bayes_nlsid.prediction.continuation import response_curves
 from bayes_nlsid.prediction.harmonics import SteadyForces
 from bayes_nlsid.prediction.response_curve import Curve
@@ -103,6 +106,22 @@ def _integrated(start: np.ndarray, w: float, level: float, periods: int) -> np.n
 
     at = 2 * np.pi / w * np.arange(periods + 1)
     return np.asarray(solve_ivp(slope, (0, at[-1]), start, method="DOP853", rtol=1e-12, atol=1e-15, t_eval=at).y.T)
+
+
+def test_modes_far_above_act_as_springs_in_series(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against all modes followed in time; leaving the high ones out altogether would be wrong."""
+    omega = 2 * np.pi * np.array([10.0, 260.0, 410.0])
+    linear = ModalModel(omega, np.full(3, 0.01), ("x", "tip"), np.array([[1.0, 6.0, -8.0], [1.0, 0.0, 0.0]]), ("tip",), ("tip",), ("x",))
+    model = Model(linear, oscillator("cubic").elements)
+    options = {"drive": "tip", "at": "tip", "levels": [5.0], "band": (8.0, 20.0)}
+    short = response_curves(model, [C], **options)[0][0]  # type: ignore[arg-type]
+    monkeypatch.setattr(stability, "FAR", 1e9)
+    whole = response_curves(model, [C], **options)[0][0]  # type: ignore[arg-type]
+    assert short.multiplier is not None and whole.multiplier is not None
+    assert np.abs(short.multiplier) == pytest.approx(np.abs(whole.multiplier), rel=3e-3)
+    flat = replace(linear, omega=omega * np.array([1.0, 1e3, 1e3]))
+    without = stability.multipliers(Model(flat, model.elements), np.array([[C]]), [whole])[0]
+    assert np.abs(np.abs(without) / np.abs(whole.multiplier) - 1).max() > 3e-2
 
 
 def test_friction_cannot_overshoot_and_memory_is_left_to_turning_points() -> None:

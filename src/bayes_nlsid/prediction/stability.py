@@ -20,6 +20,8 @@ from bayes_nlsid.prediction.response_curve import Curve
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 LEAST, MOST = 128, 2048
+FAR = 20.0
+"""Modes so many times faster than the force follow a disturbance at once, as springs in series with the joints."""
 POINTS = 512  # worked on at once
 
 
@@ -58,20 +60,23 @@ def multipliers(model: Model, theta: Array, curves: Sequence[Curve]) -> list[Com
 
 def _largest(model: Model, theta: Array, orders: tuple[int, ...], x: Array, w: Array, which: NDArray[np.intp]) -> Complex:
     """The same for a block of points (B)."""
-    omega, zeta = model.linear_values(theta)
+    omega, zeta = (values[which] for values in model.linear_values(theta))
+    slow = np.asarray((omega < FAR * w[:, None]).any(axis=0))
+    slow[omega.min(axis=0).argmin()] = True
     samples = LEAST
     while True:
         forces = SteadyForces(model, theta, Basis(orders, max(samples, 4 * orders[-1])))
         rows = model.linear.rows(forces.locations)
         stiffness, damping = forces.slopes(x[:, :len(rows)], w, which)
         h = 2 * np.pi / (w * forces.basis.samples)
-        stiff = np.nan_to_num(np.abs(stiffness).max(axis=2, initial=0.0)) @ (rows**2).sum(axis=1)
+        stiff = np.nan_to_num(np.abs(stiffness).max(axis=2, initial=0.0)) @ (rows[:, slow] ** 2).sum(axis=1)
         # a step resolves the modes and what a contact makes of them
-        fast = h**2 * np.maximum(stiff, (omega[which] ** 2).max(axis=1) / 4)
+        fast = h**2 * np.maximum(stiff, (omega[:, slow] ** 2).max(axis=1) / 4)
         if samples >= MOST or not (fast > 1.0).any():
             break
         samples *= 2
-    whole = _monodromy(omega[which], zeta[which], rows, stiffness, damping, h)
+    series = np.einsum("rm,qm,bm->brq", rows[:, ~slow], rows[:, ~slow], 1 / omega[:, ~slow] ** 2)
+    whole = _monodromy(omega[:, slow], zeta[:, slow], rows[:, slow], stiffness, damping, series, h)
     out = np.full(len(w), np.nan + 0j)
     good = np.isfinite(whole).all(axis=(1, 2))
     if good.any():
@@ -80,8 +85,8 @@ def _largest(model: Model, theta: Array, orders: tuple[int, ...], x: Array, w: A
     return out
 
 
-def _monodromy(omega: Array, zeta: Array, rows: Array, stiffness: Array, damping: Array, h: Array) -> Array:
-    """(B, 2m, 2m) of modes (B, m) with slopes (B, R, N) at rows (R, m), N steps of h (B,)."""
+def _monodromy(omega: Array, zeta: Array, rows: Array, stiffness: Array, damping: Array, series: Array, h: Array) -> Array:
+    """(B, 2m, 2m) of modes (B, m) with slopes (B, R, N) at rows (R, m) in series with flexibilities (B, R, R), N steps of h (B,)."""
     batch, m = omega.shape
     a, e = zeta * omega, np.exp(-zeta * omega * h[:, None])
     s = np.sqrt((a**2 - omega**2).astype(complex))
@@ -91,14 +96,16 @@ def _monodromy(omega: Array, zeta: Array, rows: Array, stiffness: Array, damping
     uu, uv, vu, vv = ((e * part)[..., None] for part in (cosine + a * sine, sine, -omega**2 * sine, cosine - a * sine))
     u, v = np.zeros((batch, m, 2 * m)), np.zeros((batch, m, 2 * m))
     u[:, np.arange(m), np.arange(m)] = v[:, np.arange(m), m + np.arange(m)] = 1.0
-    damped, between, across = bool(damping.any()), rows @ rows.T, rows.T
+    damped, yielding, between, across = bool(damping.any()), bool(series.any()), rows @ rows.T, rows.T
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(stiffness.shape[2]):
             if len(rows):
-                pull = (h[:, None] * stiffness[:, :, k])[..., None] * (rows @ u)
-                if damped:  # the trapezoidal rule, so that steep friction cannot overshoot
+                spring = stiffness[:, :, k, None]
+                pull = h[:, None, None] * spring * (rows @ u)
+                if damped or yielding:  # the trapezoidal rule, so that steep friction cannot overshoot
                     c = (h[:, None] * damping[:, :, k])[..., None]
-                    pull = np.asarray(np.linalg.solve(np.eye(len(rows)) + 0.5 * c * between, pull + c * (rows @ v)), dtype=float)
+                    matrix = np.eye(len(rows)) + 0.5 * c * between + spring * series
+                    pull = np.asarray(np.linalg.solve(matrix, pull + c * (rows @ v)), dtype=float)
                 v = v - across @ pull
             u, v = uu * u + uv * v, vu * u + vv * v
     return np.concatenate([u, v], axis=1)
