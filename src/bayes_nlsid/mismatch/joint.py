@@ -93,8 +93,13 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
     now = joint.at(y, theta, x, errors, None)
     cost = joint.cost(now, theta, x)
     damping, curvature = 1e-3, h.curvature
-    for _ in range(steps):
-        normal, gradient, curvature = _linearise(joint, now, y, theta, x, errors)
+    kept: tuple[Complex, Complex] | None = None
+    fresh = 0
+    while fresh < steps:
+        # columns of linear parameters are dear and change little: they serve three steps, or until they fail
+        stale = kept is not None
+        normal, gradient, curvature, kept = _linearise(joint, now, y, theta, x, errors, kept)
+        fresh += 1
         accepted = False
         for _ in range(4):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
@@ -107,12 +112,18 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
                 accepted = True
                 break
             damping = max(8 * damping, 1e-3)
-        if not accepted:
+        if not accepted and not stale:
             break
+        if not accepted:
+            kept, damping = None, 1e-3
+            continue
         gain, (y, theta, x), now, cost, damping = cost - new, trial, there, new, max(damping / 8, 1e-7)
+        kept = None if fresh % 3 == 0 else kept
         errors = finish(bench.family, theta, joint.s, now.cleaned, joint.variance, joint.ext, x, joint.sd).shape_errors
         if gain < 1e-4 * cost:
-            break
+            if not stale:
+                break
+            kept = None
     now = joint.at(y, theta, x, errors, now.motions)
     fit = finish(bench.family, theta, joint.s, now.cleaned, joint.variance, joint.ext, x, joint.sd)
     forces = list(joint.effects(y))
@@ -122,14 +133,20 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
     return found if found.cost < h.cost else h
 
 
-def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, errors: Array) -> tuple[Array, Array, Array]:
-    """Normal matrix and gradient in (y, theta, x), and the curvature in y with all linear parameters profiled out."""
+def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, errors: Array, kept: tuple[Complex, Complex] | None
+               ) -> tuple[Array, Array, Array, tuple[Complex, Complex]]:
+    """Normal matrix and gradient in (y, theta, x), the curvature in y with all linear parameters profiled out, and the columns.
+
+    ``kept``: columns of an earlier step, whose part for ``theta`` is used again.
+    """
     fam = joint.bench.family
     system = assemble(fam, theta, x, joint.s, now.cleaned, joint.variance, joint.ext)
     count = len(y) + len(theta)
     columns = np.zeros((count + len(x), now.residual.size), dtype=complex)
     change = np.zeros((count + len(x), *now.cleaned.shape), dtype=complex)
-    for i in range(count):
+    if kept is not None:
+        columns[len(y):count], change[len(y):count] = kept[0][len(y):count], kept[1][len(y):count]
+    for i in range(count if kept is None else len(y)):
         law, step = i < len(y), 1e-3 if i < len(y) else 1e-3 * float(np.clip(joint.sd[i - len(y)], 1e-3, 0.3))
         yy = y + step * (np.arange(len(y)) == i)
         tt = theta if law else theta + step * (np.arange(len(theta)) == i - len(y))
@@ -145,7 +162,7 @@ def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, error
     gradient -= prior * (np.concatenate([y, theta, x]) - centre)
     k = len(y)
     curvature = normal[:k, :k] - normal[:k, k:] @ np.linalg.solve(normal[k:, k:], normal[k:, :k])
-    return normal, gradient, curvature
+    return normal, gradient, curvature, (columns, change)
 
 
 def _columns(system: System, change: Complex, laws: int) -> tuple[Array, Array]:

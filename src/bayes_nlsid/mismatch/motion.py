@@ -78,13 +78,18 @@ class Bed:
 
     def in_time(self, D: Complex) -> tuple[Array, Array]:
         """Displacement and velocity (samples, J) of a spectrum (K, J)."""
-        both = np.concatenate([D, self.s[:, None] * D], axis=1)
-        out = np.fft.irfft(both * self.samples, self.samples, axis=0) / self.window[:, None]
-        return out[:, :D.shape[1]], out[:, D.shape[1]:]
+        rows = np.ascontiguousarray(D.T)
+        return self.wave(rows), self.wave(self.s * rows)
+
+    def wave(self, rows: Complex) -> Array:
+        """(samples, J) in time from spectra (J, K)."""
+        out = np.fft.irfft(rows, self.samples, axis=1, norm="forward")
+        return np.asarray((out if self.periodic else out / self.window).T)
 
     def to_lines(self, force: Array) -> Complex:
         """Spectrum (K, J) of forces (samples, J)."""
-        return np.asarray(np.fft.rfft(force * self.window[:, None], axis=0) / self.samples)
+        rows = np.ascontiguousarray(force.T)
+        return np.asarray(np.fft.rfft(rows if self.periodic else rows * self.window, axis=1, norm="forward").T)
 
 
 def bed(modes: Modes, spectra: Spectra, rows: Array, shaker: Array, attach: Attached = None, waveforms: Array | None = None,
@@ -198,9 +203,15 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
         damp = np.stack([np.broadcast_to(b, len(d)) for _, b in slopes], axis=1)
         inverse = _preconditioner(paths, d, v, g)
 
-        def apply(x: Complex, stiff: Array = stiff, damp: Array = damp, inverse: Complex = inverse) -> Complex:
-            dx, vx = paths.in_time(x)
-            return _mul(inverse, x + _mul(paths.among, paths.to_lines(stiff * dx + damp * vx)))
+        bent, damped = bool(stiff.any()), bool(damp.any())
+
+        def apply(x: Complex, stiff: Array = stiff, damp: Array = damp, inverse: Complex = inverse, bent: bool = bent,
+                  damped: bool = damped) -> Complex:
+            rows = np.ascontiguousarray(x.T)
+            force = stiff * paths.wave(rows) if bent or not damped else 0.0
+            if damped:
+                force = force + damp * paths.wave(paths.s * rows)
+            return _mul(inverse, x + _mul(paths.among, paths.to_lines(force)))
 
         step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / float(error)))
         length, accepted = 1.0, False
@@ -224,98 +235,88 @@ def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 38
     The motion follows from the past only, so each window is a Volterra equation with a short memory, which Newton's method solves where
     the whole record defeats it. A burst is gone through once, a period until it closes on itself.
     """
+    from bayes_nlsid.simulation.volterra import solve_window
+
     J, n = paths.to_force.shape[1], paths.samples
     d, v = paths.in_time(paths.linear(record))
-    kernel = np.fft.irfft(paths.among, n, axis=0)                                  # (n, J, J) motion per unit force sample
-    speed = np.fft.irfft(paths.s[:, None, None] * paths.among, n, axis=0)
-    K, V = np.fft.rfft(kernel, axis=0), np.fft.rfft(speed, axis=0)
-    short = [np.fft.rfft(np.concatenate([k[:window], np.zeros_like(k[:window])]), axis=0) for k in (kernel, speed)]
+    tables, reach = _tables(laws, d, v, paths.dt)
+    kernels = [np.fft.irfft(k, n, axis=0) for k in (paths.among, paths.s[:, None, None] * paths.among)]
+    spectra = [np.fft.rfft(k, axis=0) for k in kernels]
+    near = [np.ascontiguousarray(np.moveaxis(k[:window], 0, -1)) for k in kernels]
+    short = [np.fft.rfft(np.concatenate([k[:window], np.zeros_like(k[:window])]), axis=0) for k in kernels]
     g = np.zeros((n, J))
-    for _ in range(1 if not paths.periodic else 4):
-        change = 0.0
+    for _ in range(1 if not paths.periodic else 6):
+        before = g.copy()
         for first in range(0, n, window):
             here = slice(first, min(first + window, n))
-            old = g[here].copy()
-            new = _window(laws, d[here], v[here], old, old, short, window, paths.dt)
+            old, w = g[here].copy(), min(window, n - first)
+            padded = np.fft.rfft(np.concatenate([old, np.zeros((2 * window - w, J))]), axis=0)
+            own = [np.fft.irfft(_mul(k, padded), 2 * window, axis=0)[:w] for k in short]
+            solve_window(d[here] + own[0], v[here] + own[1], *near, tables, reach, g[here])
             step = np.zeros((n, J))
-            step[here] = new - old
+            step[here] = g[here] - old
             spectrum = np.fft.rfft(step, axis=0)
-            d = d - np.fft.irfft(_mul(K, spectrum), n, axis=0)
-            v = v - np.fft.irfft(_mul(V, spectrum), n, axis=0)
-            g[here] = new
-            change += float((step ** 2).sum())
-        if change < 1e-8 * float((g ** 2).sum()):
+            d = d - np.fft.irfft(_mul(spectra[0], spectrum), n, axis=0)
+            v = v - np.fft.irfft(_mul(spectra[1], spectrum), n, axis=0)
+        change = float(np.abs(g - before).max())
+        if not 1e-4 * float(np.abs(g).max()) < change < np.inf:
             break
     found = paths.linear(record) - _mul(paths.among, paths.to_lines(g))
-    sound = np.isfinite(found).all() and np.linalg.norm(found) < 10 * np.linalg.norm(paths.linear(record))
+    sound = np.isfinite(found).all() and np.abs(found).max() < 10 * np.abs(paths.linear(record)).max()
     return found if sound else paths.linear(record)
 
 
-def _window(laws: tuple[LawAlong, ...], d: Array, v: Array, old: Array, guess: Array, short: list[Complex], window: int, dt: float
-            ) -> Array:
-    """Forces (w, J) of one window such that they are the law along the motion they cause."""
-    w = len(d)
+def _tables(laws: tuple[LawAlong, ...], d: Array, v: Array, dt: float) -> tuple[Array, Array]:
+    """Laws (2, J, nodes) as functions of displacement and of velocity, and how far they reach (2, J)."""
+    from bayes_nlsid.simulation.volterra import nodes
 
-    def through(kernel: Complex, x: Array) -> Array:
-        padded = np.concatenate([x, np.zeros((2 * window - w, x.shape[1]))])
-        return np.asarray(np.fft.irfft(_mul(kernel, np.fft.rfft(padded, axis=0)), 2 * window, axis=0)[:w])
-
-    base_d, base_v = d + through(short[0], old), v + through(short[1], old)
-
-    def state(g: Array) -> tuple[Array, Array, Array]:
-        dd, vv = base_d - through(short[0], g), base_v - through(short[1], g)
-        return dd, vv, g - np.stack([law.force(dd[:, j], vv[:, j], dt) for j, law in enumerate(laws)], axis=1)
-
-    g = guess
-    dd, vv, rest = state(g)
-    size = float(np.linalg.norm(g - rest)) + 1e-300
-    for _ in range(25):
-        error = float(np.linalg.norm(rest))
-        if error < 1e-7 * size or not np.isfinite(error):
-            break
-        slopes = [law.slope(dd[:, j], vv[:, j]) for j, law in enumerate(laws) if law.slope is not None]
-        stiff, damp = np.stack([a for a, _ in slopes], axis=1), np.stack([b for _, b in slopes], axis=1)
-
-        def apply(x: Complex, stiff: Array = stiff, damp: Array = damp) -> Complex:
-            return np.asarray(x + stiff * through(short[0], x.real) + damp * through(short[1], x.real), dtype=complex)
-
-        step = gmres(apply, -rest.astype(complex), 30, 0.02).real
-        length = 1.0
-        for _ in range(8):
-            trial = state(g + length * step)
-            if np.isfinite(trial[2]).all() and float(np.linalg.norm(trial[2])) < error:
-                break
-            length /= 2.5
-        else:
-            break
-        g = g + length * step
-        dd, vv, rest = trial
-        size = max(size, float(np.linalg.norm(g)))
-    return g
+    reach = 4 * np.stack([np.abs(d).max(0), np.abs(v).max(0)]) + 1e-300
+    out = []
+    for j, law in enumerate(laws):
+        q, u = nodes(float(reach[0, j])), nodes(float(reach[1, j]))
+        none = np.zeros_like(q)
+        still = law.force(q, none, dt)
+        out.append((still, law.force(none, u, dt) - np.interp(0.0, q, still)))
+    return np.array(out).swapaxes(0, 1).copy(), reach
 
 
 def gmres(apply: Callable[[Complex], Complex], right: Complex, most: int, tolerance: float) -> Complex:
-    """Solve a real-linear equation in a complex unknown from zero, without restart, to a relative residual."""
-    norm = float(np.sqrt((np.abs(right) ** 2).sum()))
-    if norm == 0:
+    """Solve a real-linear equation in a complex unknown from zero, without restart, to a relative residual.
+
+    Classical Gram–Schmidt done twice, so that it is two matrix products; the small least-squares problem by Givens rotations.
+    """
+    flat = np.ascontiguousarray(right, dtype=complex).view(float).ravel()
+    norm = float(np.linalg.norm(flat))
+    if norm == 0 or not np.isfinite(norm):
         return right
-    basis = [right / norm]
-    hessenberg = np.zeros((most + 1, most))
-    best = np.zeros(0)
+    basis = np.empty((most + 1, flat.size))
+    basis[0] = flat / norm
+    upper, turns, target = np.zeros((most, most)), np.zeros((most, 2)), np.zeros(most + 1)
+    target[0], used = norm, 0
     for k in range(most):
-        w = apply(basis[k])
-        for i, q in enumerate(basis):
-            hessenberg[i, k] = np.vdot(q, w).real
-            w = w - hessenberg[i, k] * q
-        hessenberg[k + 1, k] = np.linalg.norm(w)
-        target = np.zeros(k + 2)
-        target[0] = norm
-        best = np.asarray(np.linalg.lstsq(hessenberg[:k + 2, :k + 1], target, rcond=None)[0])
-        left = np.linalg.norm(hessenberg[:k + 2, :k + 1] @ best - target)
-        if left < tolerance * norm or hessenberg[k + 1, k] < 1e-14 * norm:
+        w = np.ascontiguousarray(apply(basis[k].view(complex).reshape(right.shape)), dtype=complex).view(float).ravel()
+        known = basis[:k + 1]
+        column = known @ w
+        w = w - column @ known
+        again = known @ w
+        w -= again @ known
+        column += again
+        left = float(np.linalg.norm(w))
+        for i in range(k):
+            c, s = turns[i]
+            column[i], column[i + 1] = c * column[i] + s * column[i + 1], c * column[i + 1] - s * column[i]
+        length = float(np.hypot(column[k], left))
+        if not length > 0 or not np.isfinite(length):
             break
-        basis.append(w / hessenberg[k + 1, k])
-    return np.asarray(sum(c * q for c, q in zip(best, basis, strict=False)))
+        c, s = column[k] / length, left / length
+        column[k], turns[k], used = length, (c, s), k + 1
+        upper[:k + 1, k] = column
+        target[k], target[k + 1] = c * target[k], -s * target[k]
+        if abs(target[k + 1]) < tolerance * norm or left < 1e-14 * norm:
+            break
+        basis[k + 1] = w / left
+    solution = np.linalg.solve(upper[:used, :used], target[:used]) @ basis[:used] if used else np.zeros_like(flat)
+    return np.asarray(solution.view(complex).reshape(right.shape))
 
 
 def _relax(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None, most: int, tolerance: float, depth: int = 8
