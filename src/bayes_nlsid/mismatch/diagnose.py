@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit, calibrate
 from bayes_nlsid.mismatch.case import Case, CaseRecord, read_case
 from bayes_nlsid.mismatch.catalogue import ROWS
-from bayes_nlsid.mismatch.clipping import fit_clipping, suspects
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
-from bayes_nlsid.mismatch.disturb import Disturbance, disturbances
+from bayes_nlsid.mismatch.disturb import disturbances, without_hum
 from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.evidence import Evidence, gather, quiet_transfer
 from bayes_nlsid.mismatch.explain import sizes
@@ -25,24 +24,12 @@ from bayes_nlsid.mismatch.motion import bed
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis
 from bayes_nlsid.mismatch.probability import SHIPPED, Key, Layer, Score, Scores, probabilities
 from bayes_nlsid.mismatch.prove import Bands, Predictor, calibrate_bands, elpd_difference, nrmse
+from bayes_nlsid.mismatch.rivals import Rival, all_rivals, on_trial
 from bayes_nlsid.mismatch.search import Found, search
 from bayes_nlsid.mismatch.spectra import Spectra, burst_spectra, noise_density, steady_spectra
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-
-
-@final
-@dataclass(frozen=True)
-class Rival:
-    """A hypothesis of any kind with its gain over ``none``."""
-
-    key: Key
-    gain: float
-    alone: float = 0.0
-    hypothesis: Hypothesis | None = None
-    clip: tuple[tuple[int, float], ...] = ()
-    extra: tuple[Effect, ...] = ()
 
 
 @final
@@ -93,6 +80,9 @@ def analyse(case: Case, say: Progress) -> Analysis:
     """Everything but the words: evidence, calibration, all rivals with their gains."""
     notes = list(case.notes)
     spectra, held, floor = _groups(case, notes)
+    raw, humming = spectra, without_hum(case, spectra)
+    if humming is not case:
+        spectra, held, floor = _groups(humming, [])
     evidence = gather(spectra, case.band, case.mains)
     fam = family(case)
     say("calibrating the linear model")
@@ -102,16 +92,12 @@ def analyse(case: Case, say: Progress) -> Analysis:
     say("searching laws, places and channels")
     places = list(fam.places)
     found = search(bench, fit, places, case.band, say, None if linear else _quiet(fam, evidence))
-    rivals = [_rival(h, found.none) for h in found.singles]
-    best_alone = {r.key: r.gain for r in rivals}
-    for h in found.doubles:
-        one = _rival(h, found.none)
-        alone = max([best_alone.get((k,), -np.inf) for k in one.key] + [rivals[0].gain if rivals else 0.0])
-        rivals.append(replace(one, alone=max(alone, 0.0)))
-    rivals += _clipping(case, bench, fit, found.none, places, rivals, floor, say)
-    rivals = _disturbed(disturbances(case, spectra if spectra.kind == "steady" else None, fam, fit.fields.modes), rivals, case)
-    rivals.sort(key=lambda r: -r.gain)
-    return Analysis(case, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals), found, held, floor, tuple(notes))
+    noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes)
+    rivals = all_rivals(case, bench, fit, found, floor, noisy, say)
+    say("running the leading explanations on records that were not used")
+    rivals, held_none = on_trial(case, bench, fit, rivals, held, floor)
+    return Analysis(case, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals, held_none), found, held, floor,
+                    tuple(notes))
 
 
 def _groups(case: Case, notes: list[str]) -> tuple[Spectra, tuple[CaseRecord, ...], Array]:
@@ -167,60 +153,8 @@ def _mass_scale(case: Case) -> float:
     return max(0.05 * total, 1e-9)
 
 
-def _rival(h: Hypothesis, none: float) -> Rival:
-    return Rival(tuple(sorted(e.key for e in h.effects)), none - h.cost, 0.0, h)
-
-
-def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: list[str], rivals: list[Rival], noise: Array,
-              say: Progress) -> list[Rival]:
-    """Clipped channels, alone and together with what the unclipped evidence then shows."""
-    out: list[Rival] = []
-    for channel, level in suspects(case, noise)[:2]:
-        say(f"undoing the clipping of {bench.channels[channel]}")
-        level, cleaned, refit, cost = fit_clipping(bench.family, bench.evidence, fit, channel, level)
-        gain = none - cost
-        name = bench.channels[channel]
-        if gain < 10:
-            continue
-        effect = Effect("clipping", name, None, np.array([level]), ("level",), ("m/s^2",))
-        alone = Rival((("clipping", name),), gain, 0.0, _only_linear(bench, refit, cleaned, cost), ((channel, level),), (effect,))
-        out.append(alone)
-        if gain > 0.3 * max([r.gain for r in rivals] + [0.0]):
-            more = search(replace(bench, evidence=cleaned), refit, places, case.band, say)
-            for h in more.singles[:2]:
-                key = tuple(sorted([("clipping", name), *[e.key for e in h.effects]]))
-                out.append(Rival(key, none - h.cost - np.log(bench.evidence.H.size), gain, h, ((channel, level),), (effect,)))
-    return out
-
-
-def _only_linear(bench: Bench, fit: LinearFit, evidence: Evidence, cost: float) -> Hypothesis:
-    return Hypothesis((), (), fit, evidence.chi2, cost, np.zeros((0, 0)), evidence.residual, "ok")
-
-
-def _disturbed(found: list[Disturbance], rivals: list[Rival], case: Case) -> list[Rival]:
-    """Disturbances alone, and together with the best coherent rival."""
-    out = list(rivals)
-    known = set(case.classes)
-    strong = [d for d in found if d.gain > 25 and d.cls in known]
-    best = max(rivals, key=lambda r: r.gain) if rivals else None
-    for d in found:
-        if d.cls not in known or d.gain <= 0:
-            continue
-        effect = Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",))
-        out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effect,)))
-        if best is not None and d in strong and best.gain > 25 and len(best.key) == 1 and best.key[0] != (d.cls, d.place):
-            key = tuple(sorted([*best.key, (d.cls, d.place)]))
-            out.append(Rival(key, best.gain + d.gain, max(best.gain, d.gain), best.hypothesis, best.clip, (*best.extra, effect)))
-    for i, a in enumerate(strong):
-        for b in strong[i + 1:]:
-            if a.cls != b.cls:
-                key = tuple(sorted([(a.cls, a.place), (b.cls, b.place)]))
-                out.append(Rival(key, a.gain + b.gain, max(a.gain, b.gain)))
-    return out
-
-
-def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival]) -> Scores:
-    items = tuple(Score(r.key, float(r.gain), float(r.alone)) for r in rivals)
+def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival], held_none: float) -> Scores:
+    items = tuple(Score(r.key, float(r.gain), float(r.alone), r.strength, r.visible, r.rest, r.held) for r in rivals)
     best = next((r.hypothesis for r in rivals if r.hypothesis is not None), None)
     total = evidence.values + fit.dof
     leftover = found.none if best is None else best.misfit_records + best.fit.cost
@@ -228,7 +162,8 @@ def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival
     unexplained = 0.0
     if above > 12 * np.sqrt(2 * evidence.values) and best is not None:
         unexplained = float(np.clip((best.misfit_records - evidence.values) / above, 0, 1))
-    return Scores(items, unexplained, float(max(leftover / total, 1.0)))
+    linear = (fit if best is None else best.fit).cost / fit.dof
+    return Scores(items, unexplained, float(max(leftover / total, 1.0)), float(linear), held_none)
 
 
 def intervals(h: Hypothesis, effect: Effect, dispersion: float, seed: int) -> tuple[dict[str, Any], ...]:

@@ -6,7 +6,7 @@ equal if the disturbance were absent; gains are decreases of −2 log likelihood
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -18,6 +18,7 @@ from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+STRONG = 25.0  # gain from which a disturbance is taken for real
 
 
 @final
@@ -55,6 +56,42 @@ def disturbances(case: Case, spectra: Spectra | None, fam: Family, modes: Modes)
     if scatter is not None:
         out += _coherent(case, fam, modes, *scatter, spectra)
     return sorted(out, key=lambda d: -d.gain)
+
+
+def without_hum(case: Case, spectra: Spectra | None) -> Case:
+    """The case with strong mains tones taken out of its periodic and quiet records (the channels that hum only).
+
+    Tones are not in phase with the periods, so that strong ones leak over lines that carry something else. Each record gets its own
+    mains frequency, within 0.1 % of the nominal one, and its own amplitudes and phases.
+    """
+    if not case.mains > 0 or not any(d.gain > STRONG for d in _hum(case, spectra)):
+        return case
+    records = []
+    for r in case.records:
+        if not r.sealed and r.kind in ("steady", "off") and len(r.accel):
+            accel = r.accel.copy()
+            accel[:, case.usable] -= _tones(r.accel[:, case.usable], case.mains, case.rate)
+            r = replace(r, accel=accel)
+        records.append(r)
+    return replace(case, records=tuple(records))
+
+
+def _tones(accel: Array, mains: float, rate: float) -> Array:
+    """Three mains tones (n, S) by least squares, at the mains frequency that fits all channels best."""
+    n = len(accel)
+    time = (np.arange(n) - n / 2) / rate
+    window = np.hanning(n)[:, None]                      # keeps strong neighbouring lines out of the estimate
+
+    def fitted(f: float) -> tuple[float, Array]:
+        phase = 2j * np.pi * f * np.outer(time, [h for h in (1, 2, 3) if h * f < 0.45 * rate])
+        basis = np.concatenate([np.exp(phase).real, np.exp(phase).imag], axis=1)
+        coefficients = np.linalg.lstsq(basis * window, accel * window, rcond=None)[0]
+        return float(((window * (basis @ coefficients)) ** 2).sum()), basis @ coefficients
+
+    grid = mains * (1 + np.linspace(-1e-3, 1e-3, 21))
+    best = grid[int(np.argmax([fitted(f)[0] for f in grid]))]
+    finer = best + (grid[1] - grid[0]) * np.linspace(-1, 1, 9)
+    return fitted(float(finer[int(np.argmax([fitted(f)[0] for f in finer]))]))[1]
 
 
 def _quiet_blocks(case: Case, seconds: float = 1.0) -> tuple[Complex, Array] | None:

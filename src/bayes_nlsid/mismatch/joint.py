@@ -17,7 +17,17 @@ from bayes_nlsid.mismatch.calibrate import System, assemble, finish, floored, st
 from bayes_nlsid.mismatch.effects import Effect, extension, unpack
 from bayes_nlsid.mismatch.linear import solve
 from bayes_nlsid.mismatch.motion import FINER, bed
-from bayes_nlsid.mismatch.polish import Bench, Hypothesis, hypothesis, packed, paths_to_sensors, repeats, simulate, widened
+from bayes_nlsid.mismatch.polish import (
+    Bench,
+    Hypothesis,
+    force_strengths,
+    hypothesis,
+    packed,
+    paths_to_sensors,
+    repeats,
+    simulate,
+    widened,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -26,12 +36,13 @@ Complex = NDArray[np.complex128]
 @final
 @dataclass(frozen=True)
 class Point:
-    """Everything at one set of parameters: weighted projected residual, cleaned transfer function, motions for warm starts."""
+    """Everything at one set of parameters: weighted projected residual, cleaned transfer function, motions for warm starts, strengths."""
 
     residual: Complex
     cleaned: Complex
     motions: tuple[Complex, ...]
     status: str
+    strengths: Array
 
 
 @final
@@ -74,7 +85,7 @@ class Joint:
         residual = (evidence.residual + np.einsum("lsj,rlj->rls", h, projected, optimize=True)) * self.root
         shadow = np.stack([evidence.shadow(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)[evidence.excited]
         cleaned = evidence.H + np.einsum("lsj,lj->ls", h[evidence.excited], shadow)
-        return Point(residual, cleaned, there.motions, there.status)
+        return Point(residual, cleaned, there.motions, there.status, force_strengths(bench, h, there.lines))
 
     def cost(self, point: Point, theta: Array, x: Array) -> float:
         """−2 log posterior at a point."""
@@ -129,7 +140,7 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
     forces = list(joint.effects(y))
     effects = tuple(forces.pop(0) if e.is_force else e for e in h.effects)
     found = hypothesis(bench, effects, h.kinds, fit, float((np.abs(now.residual) ** 2).sum()), curvature, now.residual / joint.root,
-                       now.status)
+                       now.status, now.strengths)
     return found if found.cost < h.cost else h
 
 

@@ -208,9 +208,10 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
         def apply(x: Complex, stiff: Array = stiff, damp: Array = damp, inverse: Complex = inverse, bent: bool = bent,
                   damped: bool = damped) -> Complex:
             rows = np.ascontiguousarray(x.T)
-            force = stiff * paths.wave(rows) if bent or not damped else 0.0
             if damped:
-                force = force + damp * paths.wave(paths.s * rows)
+                force = damp * paths.wave(paths.s * rows) + (stiff * paths.wave(rows) if bent else 0.0)
+            else:
+                force = stiff * paths.wave(rows)
             return _mul(inverse, x + _mul(paths.among, paths.to_lines(force)))
 
         step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / float(error)))

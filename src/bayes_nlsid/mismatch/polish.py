@@ -62,6 +62,8 @@ class Hypothesis:
     curvature : ndarray
         Curvature of cost/2 in the force parameters (search coordinates).
     status : str
+    strengths : tuple of float
+        What each effect changes, relative to the response at the highest level (faults of one channel: of that channel).
     """
 
     effects: tuple[Effect, ...]
@@ -72,6 +74,7 @@ class Hypothesis:
     curvature: Array
     residual: Complex
     status: str
+    strengths: tuple[float, ...] = ()
 
     @property
     def forces(self) -> tuple[Effect, ...]:
@@ -228,7 +231,7 @@ def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], 
                 new = finish(fam, theta, s, cleaned, variance, None, x, sd)
         residual = evidence.residual + np.einsum(
             "lsj,rlj->rls", h, np.stack([evidence.project(lines[:, :, j]) for j in range(len(forces))], axis=-1), optimize=True)
-        found = hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status)
+        found = hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status, force_strengths(bench, h, lines))
         if best is None or found.cost < best[0]:
             better = best is None or best[0] - found.cost > 1.0 + 1e-3 * found.cost
             best = (found.cost, found)
@@ -255,11 +258,14 @@ def _merge(effects: tuple[Effect, ...], forces: tuple[Effect, ...]) -> tuple[Eff
 
 
 def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKind, ...], fit: LinearFit, misfit: float, curvature: Array,
-                residual: Complex, status: str) -> Hypothesis:
+               residual: Complex, status: str, forces: Array | None = None) -> Hypothesis:
+    """Put an estimate together; ``forces`` are the strengths of the effects that are forces, in their order."""
     free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
-    charge = free * np.log(max(bench.evidence.H.size, 2)) + _faint(bench, kinds, fit)
-    named, edges = [], 0
-    remaining = list(kinds)
+    linear = _linear_strengths(bench, kinds, effects, fit)
+    faint = FAINT_CHARGE * np.maximum(np.log(FAINT / np.maximum(linear, 1e-9)), 0.0) ** 2
+    charge = free * np.log(max(bench.evidence.H.size, 2)) + float(faint.sum())
+    named, edges, strengths = [], 0, []
+    remaining, pushing, pulling = list(kinds), list(() if forces is None else forces), list(linear)
     for e in effects:
         if not e.is_force and e.cls != "linear_stiffness":
             k = remaining.pop(0)
@@ -270,26 +276,55 @@ def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKin
             i = bench.family.names.index(e.place)
             e = replace(e, values=np.array([np.exp(fit.theta[i])]), names=("stiffness over nominal",), units=("",))
         named.append(e)
-    return Hypothesis(tuple(named), kinds, fit, misfit, misfit + fit.cost + charge, curvature, residual, status)
+        strengths.append(_stiffness_strength(bench, kinds, fit, e.place) if e.cls == "linear_stiffness" else
+                         float(pushing.pop(0)) if e.is_force and pushing else float(pulling.pop(0)) if not e.is_force else 0.0)
+    return Hypothesis(tuple(named), kinds, fit, misfit, misfit + fit.cost + charge, curvature, residual, status, tuple(strengths))
 
 
-def _faint(bench: Bench, kinds: tuple[LinearKind, ...], fit: LinearFit) -> float:
-    """Charge for linear effects that change the response by less than one per cent.
+def force_strengths(bench: Bench, h: Complex, lines: Complex) -> Array:
+    """(J,): response to each force over the response, in the record of the highest level.
 
-    Such effects are what errors of the nominal model look like; nobody would call them missing physics without much evidence.
+    Parameters
+    ----------
+    h : (L, S, J) paths from the places to the channels. lines : (R, L, J) forces.
+    """
+    spectra = bench.evidence.spectra
+    strongest = int(np.argmax(spectra.levels))
+    moved = np.linalg.norm(h * lines[strongest][:, None, :], axis=(0, 1))
+    return np.asarray(moved / max(float(np.linalg.norm(spectra.response[strongest])), 1e-300))
+
+
+def _linear_strengths(bench: Bench, kinds: tuple[LinearKind, ...], effects: tuple[Effect, ...], fit: LinearFit) -> Array:
+    """(kinds,): change of the transfer function by each linear effect, over the channel it belongs to or over all.
+
+    Those below one per cent are charged: they are what errors of the nominal model look like, and nobody would call them missing physics
+    without much evidence.
     """
     count = len(bench.channels)
-    total, edge = 0.0, 0
+    out, edge = [], 0
+    owners = [e for e in effects if not e.is_force and e.cls != "linear_stiffness"]
     for i, k in enumerate(kinds):
         others = kinds[:i] + kinds[i + 1:]
-        both = []
-        for some, x in ((kinds, fit.x), (others, np.delete(fit.x, np.arange(edge, edge + len(k.start))))):
-            fld, chain = predict(bench.family, fit.theta, fit.s, extension(some, count), x)
-            both.append(fld.H if chain is None else chain.apply(fld.H))
+        both = [_transfer(bench, fit, fit.theta, extension(some, count), x)
+                for some, x in ((kinds, fit.x), (others, np.delete(fit.x, np.arange(edge, edge + len(k.start)))))]
         edge += len(k.start)
-        strength = float(np.linalg.norm(both[0] - both[1])) / max(float(np.linalg.norm(both[0])), 1e-300)
-        total += FAINT_CHARGE * max(0.0, float(np.log(FAINT / max(strength, 1e-9)))) ** 2
-    return total
+        place = owners[i].place
+        own = [bench.channels.index(place)] if place in bench.channels else list(range(count))
+        out.append(float(np.linalg.norm((both[0] - both[1])[:, own])) / max(float(np.linalg.norm(both[0][:, own])), 1e-300))
+    return np.array(out)
+
+
+def _stiffness_strength(bench: Bench, kinds: tuple[LinearKind, ...], fit: LinearFit, place: str) -> float:
+    """Change of the transfer function when the stiffness of one place goes back to nominal."""
+    ext, theta = extension(kinds, len(bench.channels)), fit.theta.copy()
+    theta[bench.family.names.index(place)] = 0.0
+    here, back = (_transfer(bench, fit, t, ext, fit.x) for t in (fit.theta, theta))
+    return float(np.linalg.norm(here - back) / max(float(np.linalg.norm(here)), 1e-300))
+
+
+def _transfer(bench: Bench, fit: LinearFit, theta: Array, ext: Extension | None, x: Array) -> Complex:
+    fld, chain = predict(bench.family, theta, fit.s, ext, x)
+    return fld.H if chain is None else chain.apply(fld.H)
 
 
 def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, forces: tuple[Effect, ...], reference: tuple[Effect, ...],

@@ -67,11 +67,23 @@ class Score:
         Decrease of −2 log likelihood against ``none``, charges for parameters included.
     alone : float
         For a pair, the gain of the better of its members alone; else 0.
+    strength : float
+        What its smallest effect changes, relative to the response; NaN if unknown.
+    visible : float
+        What it changes that nothing simpler does, relative to the response.
+    rest : float
+        Leftover −2 log likelihood beyond its expectation.
+    held : float
+        Logarithm of the squared error on records that were not fitted over that of noise; NaN if not run.
     """
 
     key: Key
     gain: float
     alone: float = 0.0
+    strength: float = float("nan")
+    visible: float = float("nan")
+    rest: float = 0.0
+    held: float = float("nan")
 
 
 @final
@@ -80,12 +92,15 @@ class Scores:
     """All hypotheses of a case.
 
     ``unexplained``: share of the distortion above noise that the best hypothesis leaves (0 if there is none).
-    ``dispersion``: leftover chi² per degree of freedom of the best hypothesis.
+    ``dispersion``: leftover chi² per degree of freedom of the best hypothesis; ``linear``: the same of its transfer function alone;
+    ``held``: of the calibrated linear model on records not fitted, as ``Score.held``.
     """
 
     items: tuple[Score, ...]
     unexplained: float = 0.0
     dispersion: float = 1.0
+    linear: float = 1.0
+    held: float = float("nan")
 
 
 SHIPPED = Layer()
