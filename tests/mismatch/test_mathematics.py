@@ -13,7 +13,7 @@ from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
 from bayes_nlsid.mismatch.motion import LawAlong, bed, gmres, settle
 from bayes_nlsid.mismatch.poles import pair, vector_fit
-from bayes_nlsid.mismatch.probability import Layer, Score, Scores, fit_layer, probabilities
+from bayes_nlsid.mismatch.probability import Score, Scores, fit_layer, probabilities
 from bayes_nlsid.mismatch.prove import calibrate_bands, elpd_difference, nrmse
 from bayes_nlsid.mismatch.spectra import Spectra
 
@@ -218,15 +218,30 @@ def test_probabilities_sum_to_one_and_rise_with_gain() -> None:
 
 
 def test_layer_learns_where_nothing_ends() -> None:
+    """Real effects gain about 2000, chance about 200: the fitted layer must put the border between them."""
     rng = np.random.default_rng(8)
+    key = (("coulomb", "J1_slip"),)
     scores, truths = [], []
-    for i in range(40):
+    for i in range(60):
         real = i % 2 == 0
         gain = float(np.exp(rng.normal(np.log(2000) if real else np.log(200), 0.4)))
-        scores.append(Scores((Score((("coulomb", "J1_slip"),), gain),)))
-        truths.append((("coulomb", "J1_slip"),) if real else ())
-    layer = fit_layer(scores, truths, Layer())
-    assert 200 < layer.threshold < 2000
+        scores.append(Scores((Score(key, gain),)))
+        truths.append(key if real else ())
+    layer = fit_layer(scores, truths, spread=3.0)
+    chance, real_one = (probabilities(Scores((Score(key, gain),)), layer)[()] for gain in (200.0, 2000.0))
+    assert chance > 0.75 and real_one < 0.25
+
+
+def test_layer_has_calibrated_odds_where_evidence_is_weak() -> None:
+    """Two classes that swap in three of ten cases: the leading one must get seven tenths, not certainty."""
+    rng = np.random.default_rng(3)
+    a, b = (("softening", "J1_slip"),), (("hysteresis", "J1_slip"),)
+    scores, truths = [], []
+    for _ in range(300):
+        scores.append(Scores((Score(a, 5000.0), Score(b, 4900.0)), dispersion=1.5))
+        truths.append(a if rng.random() < 0.7 else b)
+    found = probabilities(scores[0], fit_layer(scores, truths, spread=3.0))
+    assert found[a] == pytest.approx(np.mean([t == a for t in truths]), abs=0.03)
 
 
 def test_bands_cover_nine_tenths_and_elpd_knows_the_better_model() -> None:

@@ -1,14 +1,16 @@
 """From scores to probabilities: a small layer whose numbers are fitted on simulated cases.
 
 Differences of −2 log likelihood between hypotheses run to thousands because what is left over is model error, not noise; taken at face
-value they would always name one class with certainty. The layer therefore lets odds fall with a power of the difference measured
-against the leftover, and lets the odds of anything at all rise with the logarithm of the gain.
+value they would always name one class with certainty. The layer weighs them together with what the likelihood does not know: how much of
+the response a hypothesis accounts for that nothing simpler does, how it does on records that were not fitted, how much is left over. It is
+a conditional logit (McFadden 1974) over the hypotheses of a case; all features are ratios, so that it does not depend on units, sizes
+or noise of the structure it was fitted on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -18,40 +20,52 @@ from bayes_nlsid.mismatch.catalogue import ROWS
 
 Array = NDArray[np.float64]
 Key = tuple[tuple[str, str], ...]
+STRANGE: Key = (("other", "-"),)
+MOST = 30  # rivals that are weighed; the rest are far behind
+
+FEATURES = (
+    "none", "other", "pair",                        # what kind of answer
+    "lag", "relative lag",                          # gain behind the best, against the leftover and against the best gain
+    "visible", "visible second",                    # response explained that nothing simpler explains (single; pair)
+    "strength",                                     # response changed by the smallest effect
+    "regret", "small regret",                       # error on records not fitted behind the best there
+    "second", "second share", "second of rest",     # what a second effect adds: against leftover, first gain, what the first left
+    "gain of best", "visible of best",              # against nothing at all
+    "unexplained", "held", "linear leftover",       # for something outside the catalogue
+    "attachment", "input or channel", "incoherent", "pair with attachment", "pair with incoherent",
+)
+_ATTACHMENTS = {"added_mass", "unmodelled_mode", "linear_stiffness", "other"}
+_CHANNELS = {"force_gain", "force_delay", "sensor_gain", "sensor_delay", "clipping"}
+_INCOHERENT = {"sensor_drift", "mains_hum", "base_motion"}
 
 
 @final
 @dataclass(frozen=True)
 class Layer:
-    """The numbers of the layer, all positive but ``slope_other``.
+    """Weights of the features.
 
     Parameters
     ----------
-    threshold, steepness : float
-        Gain at which something is as likely as nothing, and how fast the odds rise with its logarithm (coherent effects).
-    scale, share, power : float
-        Odds against a rival: (1 + difference / (scale + share * best gain)) ** −power.
-    threshold_second, steepness_second : float
-        The same as the first two for a second effect on top of a first.
-    other_at, other_width : float
-        Share of the distortion above noise left unexplained at which ``other`` is as likely as the best law, and how sharply.
+    weights : tuple of float
+        In the order of ``FEATURES``.
     provenance : str
+
+    Raises
+    ------
+    ValueError
+        If there is not one weight for every feature.
     """
 
-    threshold: float = 45.0
-    steepness: float = 3.0
-    scale: float = 12.0
-    share: float = 0.01
-    power: float = 1.5
-    threshold_second: float = 150.0
-    steepness_second: float = 2.0
-    other_at: float = 0.45
-    other_width: float = 0.08
+    weights: tuple[float, ...]
     provenance: str = "set by hand before any fit"
 
-    def numbers(self) -> Array:
-        """The fitted numbers as a vector."""
-        return np.array(astuple(self)[:-1], dtype=float)
+    def __post_init__(self) -> None:
+        if len(self.weights) != len(FEATURES):
+            raise ValueError(f"weights: {len(self.weights)} numbers, one for each of the {len(FEATURES)} features are needed")
+
+    def weight(self, name: str) -> float:
+        """Of one feature."""
+        return self.weights[FEATURES.index(name)]
 
 
 @final
@@ -103,69 +117,100 @@ class Scores:
     held: float = float("nan")
 
 
-SHIPPED = Layer()
-
-
 def sigmoid(x: float) -> float:
     """1/(1 + exp(−x)), safe for any x."""
     return float(1 / (1 + np.exp(-np.clip(x, -700, 700))))
 
 
-def probabilities(scores: Scores, layer: Layer = SHIPPED) -> dict[Key, float]:
-    """Probability of every hypothesis, of ``none`` (the empty key) and of ``other`` (key (("other", "-"),) unless scored itself).
+def features(scores: Scores) -> tuple[list[Key], Array]:
+    """Hypotheses of a case (none and "outside the catalogue" last) and their features (H, F)."""
+    items = _best_of_each(scores.items)
+    best = max((i.gain for i in items), default=0.0)
+    scale = 12.0 * max(scores.dispersion, scores.linear, 1.0)
+    helds = [i.held for i in items if np.isfinite(i.held)] + ([scores.held] if np.isfinite(scores.held) else [])
+    lowest = min(helds, default=0.0)
+    rows = [_of_item(i, best, scale, lowest) for i in items]
+    leader = max(items, key=lambda i: i.gain, default=Score((), 0.0))
+    none = dict.fromkeys(FEATURES, 0.0)
+    none |= _lags(max(best, 0.0), max(best, 0.0), scale) | _regrets(scores.held, lowest)
+    none |= {"none": 1.0, "gain of best": float(np.log1p(max(best, 0.0) / scale)), "visible of best": _decades(leader.visible, 1e-3)}
+    strange = dict.fromkeys(FEATURES, 0.0)
+    strange |= {"other": 1.0, "unexplained": float(np.clip(np.log((scores.unexplained + 1e-3) / (1.001 - scores.unexplained)), -6, 6)) + 6,
+                "held": float(np.clip(lowest, 0, 4)), "linear leftover": float(np.clip(np.log(max(scores.linear, 1.0)), 0, 4))}
+    keys = [i.key for i in items] + [(), STRANGE]
+    return keys, np.array([[row[name] for name in FEATURES] for row in (*rows, none, strange)])
+
+
+def _best_of_each(items: Sequence[Score]) -> list[Score]:
+    found: dict[Key, Score] = {}
+    for i in items:
+        if i.key and i.key != STRANGE and (i.key not in found or i.gain > found[i.key].gain):
+            found[i.key] = i
+    return sorted(found.values(), key=lambda i: -i.gain)[:MOST]
+
+
+def _of_item(i: Score, best: float, scale: float, lowest: float) -> dict[str, float]:
+    pair = len(i.key) > 1
+    classes = {cls for cls, _ in i.key}
+    added = max(i.gain - i.alone, 1e-3)
+    row = dict.fromkeys(FEATURES, 0.0) | _lags(max(best - i.gain, 0.0), max(best, 0.0), scale) | _regrets(i.held, lowest)
+    row["pair"] = float(pair)
+    row["visible second" if pair else "visible"] = _decades(i.visible, 1e-3)
+    row["strength"] = _decades(i.strength, 1e-2)
+    if pair:
+        row["second"] = float(np.clip(np.log(added / (8 * scale)), -4, 6))
+        row["second share"] = float(np.clip(np.log(added / max(best, 1e-3)), -8, 0))
+        row["second of rest"] = float(np.clip(added / (added + max(i.rest, 0.0) + 10 * scale), 0, 1))
+        row["pair with attachment"] = float(bool(classes & _ATTACHMENTS))
+        row["pair with incoherent"] = float(bool(classes & _INCOHERENT))
+    else:
+        row["attachment"] = float(bool(classes & _ATTACHMENTS))
+        row["input or channel"] = float(bool(classes & _CHANNELS))
+        row["incoherent"] = float(bool(classes & _INCOHERENT))
+    return row
+
+
+def _lags(behind: float, best: float, scale: float) -> dict[str, float]:
+    return {"lag": -float(np.log1p(behind / scale)), "relative lag": -float(np.log1p(behind / (scale + 0.01 * best)))}
+
+
+def _regrets(held: float, lowest: float) -> dict[str, float]:
+    behind = held - lowest if np.isfinite(held) else 0.05
+    return {"regret": -float(np.clip(behind, 0, 3)), "small regret": -float(np.clip(np.log1p(behind / 0.01), 0, 6))}
+
+
+def _decades(value: float, unit: float) -> float:
+    return float(np.clip(np.log10(max(value, 1e-12) / unit), -1.5, 1.5)) if np.isfinite(value) else 0.0
+
+
+def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float]:
+    """Probability of every hypothesis, of ``none`` (the empty key) and of ``other`` (key (("other", "-"),)).
 
     They sum to one.
     """
-    items = [i for i in scores.items if i.key]
-    out: dict[Key, float] = {(): 1.0}
-    if not items:
-        return out
-    best = max(i.gain for i in items)
-    dispersion = max(scores.dispersion, 1.0)
-    something = _rises(best / dispersion ** 0.5, layer.threshold, layer.steepness)
-    scale = layer.scale * dispersion + layer.share * max(best, 0.0)
-    weights: dict[Key, float] = {}
-    double = _double(items, dispersion, layer)
-    for many in (False, True):
-        group = [i for i in items if (len(i.key) > 1) == many]
-        if not group:
-            continue
-        top = max(i.gain for i in group)
-        raw: dict[Key, float] = {}
-        for item in group:
-            prior = float(np.prod([ROWS[cls].prior if cls in ROWS else 1.0 for cls, _ in item.key]))
-            raw[item.key] = max(raw.get(item.key, 0.0), prior * (1 + (top - item.gain) / scale) ** -layer.power)
-        share = double if many else 1 - double
-        for key, value in raw.items():
-            weights[key] = share * value / sum(raw.values())
-    strange: Key = (("other", "-"),)
-    odds = sigmoid((scores.unexplained - layer.other_at) / layer.other_width)
-    weights[strange] = weights.get(strange, 0.0) + max(max(weights.values()) * odds / max(1 - odds, 1e-3), 1e-4 * max(weights.values()))
-    total = sum(weights.values())
-    out[()] = 1 - something
-    for key, weight in weights.items():
-        out[key] = something * weight / total
-    norm = sum(out.values())
-    return {key: value / norm for key, value in sorted(out.items(), key=lambda kv: -kv[1])}
+    keys, table = features(scores)
+    if len(keys) == 2:
+        return {(): 1.0}
+    weights = np.array((layer or SHIPPED).weights)
+    weight = _softmax(table @ weights + np.log([_prior(k) for k in keys]))
+    return {key: float(p) for key, p in sorted(zip(keys, weight, strict=True), key=lambda kv: -kv[1])}
 
 
-def _double(items: list[Score], dispersion: float, layer: Layer) -> float:
-    """Probability that two effects act rather than one: from what the best pair gains over the better of its members alone."""
-    pairs = [i for i in items if len(i.key) > 1]
-    if not pairs:
-        return 0.0
-    if all(len(i.key) > 1 for i in items):
+def _prior(key: Key) -> float:
+    """Relative weight of the classes of a hypothesis before the data (of ``none`` and ``other`` the layer's own)."""
+    if not key or key == STRANGE:
         return 1.0
-    best = max(pairs, key=lambda i: i.gain)
-    return _rises((best.gain - best.alone) / dispersion, layer.threshold_second, layer.steepness_second)
+    return float(np.prod([ROWS[cls].prior if cls in ROWS else 1.0 for cls, _ in key]))
 
 
-def _rises(gain: float, threshold: float, steepness: float) -> float:
-    return sigmoid(steepness * np.log(max(gain, 1e-3) / threshold))
+def _softmax(x: Array) -> Array:
+    e = np.exp(x - x.max())
+    return np.asarray(e / e.sum())
 
 
-def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer = SHIPPED, provenance: str = "") -> Layer:
-    """Numbers that make the log loss over cases smallest (with a weak pull towards ``start``).
+def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer | None = None, provenance: str = "", spread: float = 1.0
+              ) -> Layer:
+    """Weights that make the log loss over cases smallest, with a normal prior of width ``spread`` around ``start``.
 
     Parameters
     ----------
@@ -173,17 +218,31 @@ def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer = SH
     """
     from scipy.optimize import minimize
 
-    origin = np.log(start.numbers())
+    origin = np.array((start or BY_HAND).weights)
+    tables = []
+    for one, truth in zip(scores, truths, strict=True):
+        keys, table = features(one)
+        wanted = tuple(sorted(truth))
+        tables.append((table, np.log([_prior(k) for k in keys]), keys.index(wanted) if wanted in keys else keys.index(STRANGE)))
 
-    def loss(x: Array) -> float:
-        layer = Layer(*np.exp(np.clip(x, -12, 12)).tolist())
-        total = 0.0
-        for one, truth in zip(scores, truths, strict=True):
-            found = probabilities(one, layer)
-            key = tuple(sorted(truth))
-            p = found.get(key, found.get((("other", "-"),), 0.0) * 0.5)
-            total -= np.log(max(p, 1e-6))
-        return total + 0.05 * float(((x - origin) ** 2).sum())
+    def loss(w: Array) -> tuple[float, Array]:
+        total, gradient = 0.5 * float(((w - origin) ** 2).sum()) / spread ** 2, (w - origin) / spread ** 2
+        for table, prior, right in tables:
+            p = _softmax(table @ w + prior)
+            total -= float(np.log(max(p[right], 1e-300)))
+            gradient = gradient + p @ table - table[right]
+        return total, gradient
 
-    best = minimize(loss, origin, method="Nelder-Mead", options={"maxiter": 1500, "xatol": 0.02, "fatol": 0.02})
-    return replace(Layer(*np.exp(best.x).tolist()), provenance=provenance or f"fitted on {len(truths)} simulated cases")
+    best = minimize(loss, origin, jac=True, method="L-BFGS-B", options={"maxiter": 500})
+    return replace(start or BY_HAND, weights=tuple(float(x) for x in best.x),
+                   provenance=provenance or f"fitted on {len(truths)} simulated cases")
+
+
+def _layer(provenance: str, **weights: float) -> Layer:
+    return Layer(tuple(weights.get(name.replace(" ", "_"), 0.0) for name in FEATURES), provenance)
+
+
+BY_HAND = _layer("set by hand before any fit", none=3.0, other=-6.0, pair=-2.0, lag=1.0, relative_lag=1.0, visible=1.0, visible_second=1.5,
+                 strength=0.5, regret=1.0, small_regret=0.3, second=1.0, second_share=0.3, second_of_rest=1.0, gain_of_best=0.5,
+                 visible_of_best=-1.0, unexplained=0.8, held=0.5, linear_leftover=0.5)
+SHIPPED = BY_HAND
