@@ -7,9 +7,10 @@ import pytest
 
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.mismatch.calibrate import calibrate
-from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, Size, catalogue_rows
+from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, catalogue_rows
 from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.evidence import gather
+from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
 from bayes_nlsid.mismatch.motion import LawAlong, bed, gmres, settle
 from bayes_nlsid.mismatch.poles import pair, vector_fit

@@ -17,7 +17,7 @@ from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.disturb import disturbances, without_hum
 from bayes_nlsid.mismatch.effects import Effect, pack
-from bayes_nlsid.mismatch.evidence import Evidence, gather, quiet_transfer
+from bayes_nlsid.mismatch.evidence import Evidence, gather, level_transfer
 from bayes_nlsid.mismatch.explain import sizes
 from bayes_nlsid.mismatch.linear import Family, family
 from bayes_nlsid.mismatch.motion import bed
@@ -91,7 +91,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
     bench = _bench(case, fam, fit, evidence)
     say("searching laws, places and channels")
     places = list(fam.places)
-    found = search(bench, fit, places, case.band, say, None if linear else _quiet(fam, evidence))
+    found = search(bench, fit, places, case.band, say, () if linear else _one_level(fam, evidence))
     noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes)
     rivals = all_rivals(case, bench, fit, found, floor, noisy, say)
     say("running the leading explanations on records that were not used")
@@ -140,10 +140,10 @@ def _bench(case: Case, fam: Family, fit: LinearFit, evidence: Evidence) -> Bench
     return Bench(fam, evidence, names, _mass_scale(case), stiffness, scale)
 
 
-def _quiet(fam: Family, evidence: Evidence) -> LinearFit | None:
-    """Calibration to the lowest level alone."""
-    found = quiet_transfer(evidence)
-    return None if found is None else calibrate(fam, evidence.spectra.s[evidence.excited], *found, restarts=4)
+def _one_level(fam: Family, evidence: Evidence) -> tuple[LinearFit, ...]:
+    """Calibrations to the lowest level alone and to the highest alone."""
+    found = [level_transfer(evidence, loud) for loud in (False, True)]
+    return tuple(calibrate(fam, evidence.spectra.s[evidence.excited], *f, restarts=4) for f in found if f is not None)
 
 
 def _mass_scale(case: Case) -> float:
@@ -188,7 +188,7 @@ def intervals(h: Hypothesis, effect: Effect, dispersion: float, seed: int) -> tu
         elif effect.law.free[i] == "log":
             values = np.exp(np.clip(draws[:, column], -80, 80))
         else:
-            scale = max(abs(float(effect.values[i])), 1e-12) if effect.law.term.name == "one_sided_spring" else 1.0
+            scale = max(abs(float(effect.values[i])), 1e-12) if effect.law.free[i] == "signed" else 1.0
             values = draws[:, column] * scale
         q = np.quantile(values, [0.05, 0.5, 0.95])
         out.append({"name": f"{effect.cls}[{effect.place}].{effect.names[i]}", "unit": effect.units[i],

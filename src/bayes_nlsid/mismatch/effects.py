@@ -9,9 +9,10 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.mismatch.calibrate import Chain, Extension
-from bayes_nlsid.mismatch.catalogue import Law
+from bayes_nlsid.mismatch.laws import Law
 from bayes_nlsid.mismatch.linear import Attachment, Family
 
 Array = NDArray[np.float64]
@@ -64,8 +65,13 @@ def along_period(law: Law, values: Array, d: Array, v: Array, dt: float, periodi
     first = int(np.argmax(np.abs(d))) if periodic else 0
     if law.term.name in ("iwan4_memory", "jenkins_memory"):
         return np.asarray(np.roll(_sliding(law, values, np.roll(d, -first)), first, axis=-1))
-    path = motion(np.append(np.roll(d, -first), d[first]), np.append(np.roll(v, -first), v[first]), dt)
-    force = force_along(law.term, path, values, excess=law.excess)[..., :-1]
+    rolled, speed, n = np.roll(d, -first), np.roll(v, -first), len(d)
+    turns = 2 if periodic else 1                          # a rate law forgets its start within a period
+    path = motion(np.append(np.tile(rolled, turns), rolled[0]), np.append(np.tile(speed, turns), speed[0]), dt)
+    p = np.asarray(values, dtype=float)
+    inner = p if law.convert is None else law.convert(p).reshape(*p.shape[:-1], -1)
+    term = law.term if law.convert is None else LIBRARY[law.term.memory]
+    force = force_along(term, path, inner, excess=law.excess)[..., -n - 1:-1]
     return np.asarray(np.roll(force, first, axis=-1))
 
 
@@ -132,7 +138,7 @@ def unpack(effect: Effect, x: Array, reference: Effect) -> Effect:
     for i, value in zip(free, x, strict=True):
         param = effect.law.term.params[i]
         values[i] = np.exp(np.clip(value, -80, 80)) if effect.law.free[i] == "log" else value * _scale(reference, i)
-        if param.rule == "range" and effect.law.term.name != "one_sided_spring":
+        if param.rule == "range":
             values[i] = np.clip(values[i], param.lower, param.upper)
     return replace(effect, values=values)
 
@@ -143,7 +149,7 @@ def _to(effect: Effect, i: int, kind: str) -> float:
 
 
 def _scale(effect: Effect, i: int) -> float:
-    return max(abs(float(effect.values[i])), 1e-12) if effect.law is not None and effect.law.term.name == "one_sided_spring" else 1.0
+    return max(abs(float(effect.values[i])), 1e-12) if effect.law is not None and effect.law.free[i] == "signed" else 1.0
 
 
 def _unit(effect: Effect) -> float:

@@ -7,6 +7,7 @@ the joint estimation in ``polish``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -14,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.catalogue import CATALOGUE, Law, Size
+from bayes_nlsid.mismatch.catalogue import CATALOGUE
 from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period
 from bayes_nlsid.mismatch.evidence import Evidence
+from bayes_nlsid.mismatch.laws import Law, Size
 from bayes_nlsid.mismatch.linear import Family, Modes, receptances
 from bayes_nlsid.mismatch.motion import Bed, bed
 
@@ -75,12 +77,12 @@ def sensor_paths(fam: Family, modes: Modes, s: Complex, places: list[str], error
     return np.asarray(s[:, None, None] ** 2 * out)
 
 
-def sizes(paths: Bed, places: list[str]) -> dict[str, Size]:
-    """Scales of motion at each place in the record where it moves most."""
+def sizes(paths: Bed, places: list[str], motions: Sequence[Complex] | None = None) -> dict[str, Size]:
+    """Scales of motion at each place in the record where it moves most; ``motions`` (K, J) per record, the linear ones by default."""
     out = {}
     best: Array = np.zeros((len(places), 3))
     for r in range(len(paths.drive)):
-        d, v = paths.in_time(paths.linear(r))
+        d, v = paths.in_time(paths.linear(r) if motions is None else motions[r])
         scale = np.stack([d.std(0), v.std(0), np.abs(d).max(0)], axis=1)
         best = np.where(scale[:, :1] > best[:, :1], scale, best)
     for name, row in zip(places, best, strict=True):
@@ -88,22 +90,25 @@ def sizes(paths: Bed, places: list[str]) -> dict[str, Size]:
     return out
 
 
-def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[str], residual: Complex | None = None
+def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[str], residual: Complex | None = None,
+                paths: Bed | None = None, motions: Sequence[Complex] | None = None
                 ) -> tuple[list[Candidate], list[Latent], dict[str, Size]]:
     """All force laws and drifts at all places.
 
     Parameters
     ----------
     residual : (R, L, S) projected residual to explain; that of ``evidence`` by default.
+    paths, motions : bed of all places and the motions (K, J) there per record on which laws are tried; by default those of the linear model.
     """
     spectra = evidence.spectra
     modes = fit.fields.modes
     rows = np.array([fam.places[p] for p in places])
-    paths = bed(modes, spectra, rows, fam.shaker)
-    scale = sizes(paths, places)
+    paths = bed(modes, spectra, rows, fam.shaker) if paths is None else paths
+    motions = [paths.linear(r) for r in range(len(spectra.names))] if motions is None else motions
+    scale = sizes(paths, places, motions)
     h = sensor_paths(fam, modes, spectra.s, places, fit.shape_errors)
     data = evidence.residual if residual is None else residual
-    moved = [paths.in_time(paths.linear(r)) for r in range(len(spectra.names))]
+    moved = [paths.in_time(D) for D in motions]
     candidates: list[Candidate] = []
     latents: list[Latent] = []
     start = spectra.starts - spectra.starts.mean()
@@ -122,7 +127,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
                 if best is not None and best.gain > 0:
                     candidates.append(best)
         if np.ptp(spectra.starts) > 0:
-            D = np.array([paths.linear(r)[spectra.lines, j] for r in range(len(tau))])
+            D = np.array([m[spectra.lines, j] for m in motions])
             columns = np.array([D * tau[:, None], D * (tau ** 2)[:, None]])
             gain, coefficients = _regress(evidence, columns, z, weight)
             candidates.append(Candidate(Effect("stiffness_drift", place, None, coefficients, ("trend", "curvature"), ("N/m", "N/m")), gain))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import System, assemble, finish, floored, stack
 from bayes_nlsid.mismatch.effects import Effect, extension, unpack
 from bayes_nlsid.mismatch.linear import solve
-from bayes_nlsid.mismatch.motion import FINER, bed
+from bayes_nlsid.mismatch.motion import bed
 from bayes_nlsid.mismatch.polish import (
     Bench,
     Hypothesis,
@@ -57,8 +57,6 @@ class Joint:
         self.ext = extension(h.kinds, len(bench.channels))
         self.unique = repeats(bench.evidence.spectra)
         self.root = np.sqrt(2 * bench.evidence.trust[:, None, None] * bench.evidence.weight)
-        remembers = any(e.law is not None and e.law.term.memory != "none" for e in self.forces)
-        self.finer = 1 if remembers else FINER
         self.y0 = [packed(e, e) for e in self.forces]
         self.edges = np.concatenate([[0], np.cumsum([len(p) for p in self.y0])]).astype(int)
         evidence = bench.evidence
@@ -76,7 +74,7 @@ class Joint:
         spectra = evidence.spectra
         modes = solve(bench.family, theta)
         parts = (lambda q: ((), None)) if self.ext is None else (lambda q: self.ext.parts(x, q))  # type: ignore[union-attr]
-        paths = bed(modes, spectra, self.rows, bench.family.shaker, lambda q: parts(q)[0], finer=self.finer)
+        paths = bed(modes, spectra, self.rows, bench.family.shaker, lambda q: parts(q)[0])
         fld = replace(self.h.fit.fields, modes=modes)
         fit = replace(self.h.fit, fields=fld, shape_errors=errors)
         h = paths_to_sensors(bench, fit, self.places, spectra.s, parts(spectra.s))

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored, predict
-from bayes_nlsid.mismatch.catalogue import Size
 from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
+from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
-from bayes_nlsid.mismatch.motion import FINER, Bed, LawAlong, bed, settle
+from bayes_nlsid.mismatch.motion import Bed, LawAlong, bed, settle
 from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]
@@ -145,6 +145,23 @@ def simulate(paths: Bed, spectra: Spectra, effects: tuple[Effect, ...], unique: 
         out[r] = G[spectra.lines]
         motions.append(D)
     return Simulated(out, tuple(motions), status)
+
+
+def everywhere(bench: Bench, h: Hypothesis, places: list[str]) -> tuple[Bed, list[Complex]]:
+    """Bed of all ``places`` and the motions (K, J) there per record, with the forces of ``h`` acting."""
+    fam, spectra, channels = bench.family, bench.evidence.spectra, len(bench.channels)
+    rows = np.array([fam.places[p] for p in places])
+    paths = bed(h.fit.fields.modes, spectra, rows, fam.shaker, lambda s: h.parts(channels)(s)[0])
+    at = [places.index(e.place) for e in h.forces]
+    own = replace(paths, to_force=paths.to_force[:, at], among=paths.among[:, at][:, :, at])
+    times = day(spectra, spectra.starts)
+    found = simulate(own, spectra, h.forces, repeats(spectra), None)
+    out = []
+    for r, D in enumerate(found.motions):
+        d, v = own.in_time(D)
+        g = np.stack([law_of(e, times[r], own.periodic).force(d[:, j], v[:, j], own.dt) for j, e in enumerate(h.forces)], axis=1)
+        out.append(np.asarray(paths.linear(r) - np.einsum("kjp,kp->kj", paths.among[:, :, at], own.to_lines(g), optimize=True)))
+    return paths, out
 
 
 def repeats(spectra: Spectra) -> list[int]:
@@ -336,8 +353,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     places = [e.place for e in forces]
     rows = np.array([fam.places[p] for p in places])
     parts = ((lambda s: ((), None)) if ext is None else partial(ext.parts, x))
-    remembers = any(e.law is not None and e.law.term.memory != "none" for e in forces)
-    paths = bed(fit.fields.modes, spectra, rows, fam.shaker, lambda s: parts(s)[0], finer=1 if remembers else FINER)
+    paths = bed(fit.fields.modes, spectra, rows, fam.shaker, lambda s: parts(s)[0])
     h = paths_to_sensors(bench, fit, places, spectra.s, parts(spectra.s))
     root = np.sqrt(2 * evidence.trust[:, None, None] * evidence.weight)
     data = evidence.residual * root
@@ -392,6 +408,6 @@ def packed(effect: Effect, reference: Effect) -> Array:
     out = pack(effect)
     free = [i for i, kind in enumerate(effect.law.free) if kind != "fixed"]
     for k, i in enumerate(free):
-        if effect.law.free[i] == "linear" and effect.law.term.name == "one_sided_spring":
+        if effect.law.free[i] == "signed":
             out[k] = effect.values[i] / max(abs(float(reference.values[i])), 1e-12)
     return out

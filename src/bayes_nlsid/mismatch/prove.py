@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.case import Case, CaseRecord
 from bayes_nlsid.mismatch.linear import Family, Modes, receptances, solve
-from bayes_nlsid.mismatch.motion import FINER, bed, settle
+from bayes_nlsid.mismatch.motion import bed, settle
 from bayes_nlsid.mismatch.polish import Hypothesis, day, law_of
 from bayes_nlsid.mismatch.spectra import Spectra
 
@@ -71,9 +71,7 @@ class Predictor:
         if forces:
             rows = np.array([fam.places[e.place] for e in forces])
             attach = None if self.hypothesis is None else (lambda q: self.hypothesis.parts(self.channels)(q)[0])  # type: ignore[union-attr]
-            remembers = any(e.law is not None and e.law.term.memory != "none" for e in forces)
-            finer = 1 if remembers else FINER
-            paths = bed(modes, spectra, rows, fam.shaker, attach, finer=finer)
+            paths = bed(modes, spectra, rows, fam.shaker, attach)
             time = float(day(self.reference, np.array([record.start]))[0])
             laws = tuple(law_of(e, float(np.clip(time, -1.0, 1.6)), paths.periodic) for e in forces)
             _, G, status = settle(paths, 0, laws, most=60)

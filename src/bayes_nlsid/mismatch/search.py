@@ -13,7 +13,7 @@ from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.effects import Effect
 from bayes_nlsid.mismatch.explain import Candidate, Latent, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import refine
-from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate, everywhere
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -43,19 +43,19 @@ class Found:
     first: tuple[Candidate, ...]
 
 
-def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress, quiet: LinearFit | None = None
+def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, float], say: Progress, others: tuple[LinearFit, ...] = ()
            ) -> Found:
     """Singles, then pairs that begin with the best single.
 
-    ``quiet`` is the calibration to the lowest level, where amplitude-dependent laws sleep: forces are looked for with both.
+    ``others`` are calibrations to one level, where some laws sleep: forces are looked for with all of them.
     """
     none = bench.evidence.chi2 + fit.cost
     forces, latents, _ = scan_forces(bench.family, fit, bench.evidence, places)
     begin = fit
-    if quiet is not None:
-        others, more, _ = scan_forces(bench.family, quiet, bench.evidence, places)
-        if others and others[0].gain > (forces[0].gain if forces else 0.0):
-            forces, latents, begin = others, more, quiet
+    for other in others:
+        found, more, _ = scan_forces(bench.family, other, bench.evidence, places)
+        if found and found[0].gain > (forces[0].gain if forces else 0.0):
+            forces, latents, begin = found, more, other
     linear = scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
@@ -75,11 +75,11 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         centre = 1.5 * float(np.sqrt(band[0] * band[1]))
         slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
         singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
-    if quiet is not None:
-        # the leaders also from the other calibration: a law that was strong has bent one of the two
-        other = fit if begin is quiet else quiet
-        again = [estimate(bench, other, (c,), rounds=3) for c in short[:2]]
-        singles = _better(singles, again)
+    for other in (fit, *others):
+        # the leaders also from the other calibrations: a law that was strong has bent some of them
+        if other is not begin and singles and _poor(bench, singles[0]):
+            singles = _better(singles, [estimate(bench, other, (c,), rounds=3) for c in short[:2]])
+    singles = _again(bench, singles, places, none, say)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
@@ -135,15 +135,44 @@ def _better(first: list[Hypothesis], second: list[Hypothesis]) -> list[Hypothesi
     return sorted(best.values(), key=lambda h: h.cost)
 
 
+def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: float, say: Progress, turns: int = 2) -> list[Hypothesis]:
+    """All laws once more, on the motion that the leading one has brought close to the truth, while that changes who leads.
+
+    A law that is strong moves its place otherwise than the linear model says, so that the first search may miss it; a law of the wrong
+    class still brings the motion most of the way.
+    """
+    for _ in range(turns):
+        lead = singles[0] if singles else None
+        if lead is None or len(lead.forces) != 1 or none - lead.cost < 200 or not _poor(bench, lead):
+            break
+        say("looking again at the motion that the leading law brings about")
+        lead = refine(bench, lead, steps=3)
+        paths, motions = everywhere(bench, lead, places)
+        forces, _, _ = scan_forces(bench.family, lead.fit, bench.evidence, places, None, paths, motions)
+        top = forces[0].gain if forces else 0.0
+        own = lead.effects[0]
+        fresh = [c for c in _unique(forces) if c.gain > 0.5 * top and (c.effect.key != own.key or c.effect.law is not own.law)]
+        tried = [estimate(bench, lead.fit, (c,), rounds=3) for c in fresh[:4]]
+        new = _better([lead, *singles], tried)
+        won = new[0].cost < lead.cost - 1.0
+        singles = new
+        if not won:
+            break
+    return singles
+
+
+def _poor(bench: Bench, h: Hypothesis) -> bool:
+    return h.misfit_records > 1.02 * bench.evidence.values or h.fit.cost > 1.1 * h.fit.dof
+
+
 def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> list[Hypothesis]:
     """Joint iterations for the force hypotheses that are still in the race and leave a misfit; more rounds for the others."""
     if not singles or none - singles[0].cost < 30:
         return singles
     gain = none - singles[0].cost
-    values, dof = bench.evidence.values, singles[0].fit.dof
     out = []
     for i, h in enumerate(singles):
-        poor = h.misfit_records > 1.02 * values or h.fit.cost > 1.1 * dof
+        poor = _poor(bench, h)
         if h.forces and i < 3 and h.cost - singles[0].cost < 0.3 * gain:
             if poor and gain > 200 and i < 2:
                 h = refine(bench, h, steps=10)
