@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.forces.library import LIBRARY
+from bayes_nlsid.forces.march import compiled_wanted, march
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.mismatch.calibrate import Chain, Extension
 from bayes_nlsid.mismatch.laws import Law
@@ -65,14 +65,22 @@ def along_period(law: Law, values: Array, d: Array, v: Array, dt: float, periodi
     first = int(np.argmax(np.abs(d))) if periodic else 0
     if law.term.name in ("iwan4_memory", "jenkins_memory"):
         return np.asarray(np.roll(_sliding(law, values, np.roll(d, -first)), first, axis=-1))
-    rolled, speed, n = np.roll(d, -first), np.roll(v, -first), len(d)
-    turns = 2 if periodic else 1                          # a rate law forgets its start within a period
-    path = motion(np.append(np.tile(rolled, turns), rolled[0]), np.append(np.tile(speed, turns), speed[0]), dt)
     p = np.asarray(values, dtype=float)
-    inner = p if law.convert is None else law.convert(p).reshape(*p.shape[:-1], -1)
-    term = law.term if law.convert is None else LIBRARY[law.term.memory]
-    force = force_along(term, path, inner, excess=law.excess)[..., -n - 1:-1]
+    if law.convert is not None:
+        return _looping(law, p, d, periodic)
+    path = motion(np.append(np.roll(d, -first), d[first]), np.append(np.roll(v, -first), v[first]), dt)
+    force = force_along(law.term, path, p, excess=law.excess)[..., :-1]
     return np.asarray(np.roll(force, first, axis=-1))
+
+
+def _looping(law: Law, p: Array, d: Array, periodic: bool) -> Array:
+    """A rate law node by node; within a period it forgets how it began, so that part of the period before is enough of a start."""
+    assert law.convert is not None and law.term.stiffness is not None
+    before = d[-(len(d) // 3):] if periodic else d[:0]
+    force = march(law.term.memory, np.concatenate([before, d]), law.convert(p))[:, len(before):]
+    if law.excess:
+        force = force - np.asarray(law.term.stiffness(*np.atleast_2d(p).T))[:, None] * d
+    return force.reshape(*p.shape[:-1], len(d))
 
 
 def _sliding(law: Law, values: Array, d: Array, bins: int = 14) -> Array:
@@ -83,6 +91,14 @@ def _sliding(law: Law, values: Array, d: Array, bins: int = 14) -> Array:
     """
     p = np.atleast_2d(values)
     stiffness, slip = _sliders(law, p, bins)                                       # (B, k)
+    if compiled_wanted():
+        from bayes_nlsid.forces.compiled import march_sliders
+
+        moves = np.diff(d, prepend=0.0)
+        force = march_sliders(moves, np.ascontiguousarray(stiffness), np.ascontiguousarray(slip), np.ones(len(p)))
+        if law.excess:
+            force -= stiffness.sum(1)[:, None] * d
+        return np.asarray(force.reshape(*np.shape(values)[:-1], len(d)))
     turn = np.concatenate([[0], 1 + np.flatnonzero((d[1:-1] - d[:-2]) * (d[2:] - d[1:-1]) < 0), [len(d) - 1]])
     piece = np.clip(np.searchsorted(turn, np.arange(len(d)), side="right") - 1, 0, len(turn) - 2)
     start = np.clip(d[0], -slip, slip)

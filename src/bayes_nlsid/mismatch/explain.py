@@ -21,6 +21,7 @@ from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.laws import Law, Size
 from bayes_nlsid.mismatch.linear import Family, Modes, receptances
 from bayes_nlsid.mismatch.motion import Bed, bed
+from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -139,7 +140,11 @@ def _best_shape(evidence: Evidence, law: Law, shapes: Array, paths: Bed, moved: 
                 weight: Array, cls: str, place: str) -> Candidate:
     spectra = evidence.spectra
     columns = np.empty((len(shapes), len(moved), len(spectra.lines)), dtype=complex)
+    unique = repeats(spectra)
     for r, (d, v) in enumerate(moved):
+        if unique[r] < r:
+            columns[:, r] = columns[:, unique[r]]
+            continue
         g = along_period(law, shapes, d[:, j], v[:, j], paths.dt, paths.periodic)
         columns[:, r] = np.fft.rfft(g * paths.window, axis=1)[:, spectra.lines] / paths.samples
     columns = -evidence.project(columns)

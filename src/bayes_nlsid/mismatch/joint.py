@@ -24,10 +24,10 @@ from bayes_nlsid.mismatch.polish import (
     hypothesis,
     packed,
     paths_to_sensors,
-    repeats,
     simulate,
     widened,
 )
+from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -22,7 +22,7 @@ from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
 from bayes_nlsid.mismatch.motion import Bed, LawAlong, bed, settle
-from bayes_nlsid.mismatch.spectra import Spectra
+from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -162,21 +162,6 @@ def everywhere(bench: Bench, h: Hypothesis, places: list[str]) -> tuple[Bed, lis
         g = np.stack([law_of(e, times[r], own.periodic).force(d[:, j], v[:, j], own.dt) for j, e in enumerate(h.forces)], axis=1)
         out.append(np.asarray(paths.linear(r) - np.einsum("kjp,kp->kj", paths.among[:, :, at], own.to_lines(g), optimize=True)))
     return paths, out
-
-
-def repeats(spectra: Spectra) -> list[int]:
-    """For every record the first one with the same force history."""
-    out = []
-    w = spectra.waveforms
-    norms = np.linalg.norm(w, axis=1)
-    for r in range(len(w)):
-        first = r
-        for q in range(r):
-            if abs(norms[r] - norms[q]) < 2e-3 * norms[r] and w[r] @ w[q] > 0.9995 * norms[r] * norms[q]:
-                first = q
-                break
-        out.append(first)
-    return out
 
 
 def widened(fam: Family, places: set[str]) -> Array:

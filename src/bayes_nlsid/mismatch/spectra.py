@@ -217,3 +217,18 @@ def _excited_lines(case: Case, force: Complex, noise: Array) -> Mask:
         return out & (power > 20 * noise)
     strong = power > max(1e-3 * float(np.quantile(power, 0.98)), 30 * float(np.median(noise)))
     return np.asarray(strong)
+
+
+def repeats(spectra: Spectra) -> list[int]:
+    """For every record the first one with the same force history."""
+    out = []
+    w = spectra.waveforms
+    norms = np.linalg.norm(w, axis=1)
+    for r in range(len(w)):
+        first = r
+        for q in range(r):
+            if abs(norms[r] - norms[q]) < 2e-3 * norms[r] and w[r] @ w[q] > 0.9995 * norms[r] * norms[q]:
+                first = q
+                break
+        out.append(first)
+    return out
