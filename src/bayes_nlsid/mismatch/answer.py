@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
                  "linear_misfit_per_value": analysis.fit.cost / analysis.fit.dof}
     figures = _figures(analysis, proof, odds)
     return Diagnosis(analysis.case.name, seed, clock.perf_counter() - begun, verdict, p_mismatch, where, hypotheses, heldout, sentence,
-                     detection, tuple(notes), predictions, figures)
+                     detection, tuple(notes), predictions, figures, asdict(analysis.scores))
 
 
 def _linear_only(rival: Rival) -> bool:

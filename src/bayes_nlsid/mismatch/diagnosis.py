@@ -64,6 +64,8 @@ class Diagnosis:
         ``<record>_accel_q05/_q50/_q95`` (n, s) m/s² of sealed records.
     figures : dict of str to ndarray
         Numbers behind the figures.
+    scores : dict
+        What the probabilities were made from, for a refit of the layer.
     """
 
     case: str
@@ -79,6 +81,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     predictions: Mapping[str, Array] = field(default_factory=dict)
     figures: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    scores: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.verdict not in ("none", "mismatch", "cannot_tell"):
@@ -99,10 +102,13 @@ class Diagnosis:
 
 
 def write_diagnosis(diagnosis: Diagnosis, out: str | Path) -> None:
-    """Write ``diagnosis.json``, ``predictions.npz`` and ``figures.npz`` (numbers behind the figures) into the folder ``out``."""
+    """Write ``diagnosis.json``, ``predictions.npz``, ``figures.npz`` (numbers behind the figures) and ``scores.json`` (numbers behind the
+    probabilities) into the folder ``out``."""
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "diagnosis.json").write_text(json.dumps(_plain(diagnosis.as_dict()), indent=1, ensure_ascii=False) + "\n")
+    if diagnosis.scores:
+        (folder / "scores.json").write_text(json.dumps(_plain(dict(diagnosis.scores))) + "\n")
     predictions: dict[str, Any] = {k: v.astype(np.float32) for k, v in diagnosis.predictions.items()}
     figures: dict[str, Any] = dict(diagnosis.figures)
     np.savez_compressed(folder / "predictions.npz", **predictions)

@@ -70,13 +70,13 @@ def without_hum(case: Case, spectra: Spectra | None) -> Case:
     for r in case.records:
         if not r.sealed and r.kind in ("steady", "off") and len(r.accel):
             accel = r.accel.copy()
-            accel[:, case.usable] -= _tones(r.accel[:, case.usable], case.mains, case.rate)
+            accel[:, case.usable] -= tones(r.accel[:, case.usable], case.mains, case.rate)
             r = replace(r, accel=accel)
         records.append(r)
     return replace(case, records=tuple(records))
 
 
-def _tones(accel: Array, mains: float, rate: float) -> Array:
+def tones(accel: Array, mains: float, rate: float) -> Array:
     """Three mains tones (n, S) by least squares, at the mains frequency that fits all channels best."""
     n = len(accel)
     time = (np.arange(n) - n / 2) / rate

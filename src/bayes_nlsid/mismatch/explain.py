@@ -99,7 +99,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
     Parameters
     ----------
     residual : (R, L, S) projected residual to explain; that of ``evidence`` by default.
-    paths, motions : bed of all places and the motions (K, J) there per record on which laws are tried; by default those of the linear model.
+    paths, motions : bed of all places and the motions (K, J) there per record on which laws are tried; by default the linear ones.
     """
     spectra = evidence.spectra
     modes = fit.fields.modes

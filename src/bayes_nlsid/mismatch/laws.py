@@ -118,12 +118,15 @@ ROUNDED_GAP = Term("rounded_gap", "k*w*e*(log(1 + exp((q - e)/(w*e))) - log(1 + 
                    lambda q, v, k, e, w: (k * (_step((q - e) / (w * e)) + _step((-q - e) / (w * e))), 0 * q),
                    meaning="gap on both sides with rough faces")
 
+def _stop_slope(y: Array, k: Array, n: Array) -> Array:
+    return np.asarray(k * n * np.where(y > 0, np.maximum(y, 1e-12) ** (n - 1), 0.0))
+
+
 ONE_STOP = Term("one_stop", "k*e*max(sign(k)*q/e - 1, 0)**n",
                 (Param("k", "N/m", "coefficient", meaning="stiffness scale; negative: the stop is on the other side"),
                  Param("e", "m", "displacement", meaning="gap"), Param("n", "", "range", 1.0, 2.0, "exponent, 1.5 for a round body")),
                 lambda q, v, k, e, n: k * e * np.maximum(np.sign(k) * q / e - 1, 0.0) ** n,
-                lambda q, v, k, e, n: (np.abs(k) * n * np.where(np.sign(k) * q > e, np.maximum(np.sign(k) * q / e - 1, 1e-12) ** (n - 1), 0.0),
-                                       0 * q),
+                lambda q, v, k, e, n: (_stop_slope(np.sign(k) * q / e - 1, np.abs(k), n), 0 * q),
                 parity="none", meaning="stop on one side beyond a gap")
 
 TWO_STOPS = Term("two_stops", "k*(max(q - e, 0) - r*max(-q - u*e, 0))",
@@ -136,14 +139,16 @@ TWO_STOPS = Term("two_stops", "k*(max(q - e, 0) - r*max(-q - u*e, 0))",
 
 ONE_SIDED = Term("one_sided_spring", "k*where(q > e*d, q - e*d, 0)",
                  (Param("k", "N/m", "coefficient", meaning="stiffness on one side"),
-                  Param("e", "", "range", -3.0, 3.0, "where it begins, over d"), Param("d", "m", "displacement", meaning="reference, fixed")),
+                  Param("e", "", "range", -3.0, 3.0, "where it begins, over d"),
+                  Param("d", "m", "displacement", meaning="reference, fixed")),
                  lambda q, v, k, e, d: k * np.where(q > e * d, q - e * d, 0.0),
                  lambda q, v, k, e, d: (k * np.where(q > e * d, 1.0, 0.0), 0 * q), parity="none",
                  meaning="stiffness that differs between opening and closing")
 
 BENT = Term("bent_spring", "k*d*(sqrt((q/d - e)**2 + w**2) - sqrt(e**2 + w**2))/2",
             (Param("k", "N/m", "coefficient", meaning="difference of stiffness between the two directions"),
-             Param("e", "", "range", -3.0, 3.0, "where it changes, over d"), Param("w", "", "range", 0.02, 20.0, "over how much motion, over d"),
+             Param("e", "", "range", -3.0, 3.0, "where it changes, over d"),
+             Param("w", "", "range", 0.02, 20.0, "over how much motion, over d"),
              Param("d", "m", "displacement", meaning="reference, fixed")),
             lambda q, v, k, e, w, d: 0.5 * k * d * (np.sqrt((q / d - e) ** 2 + w ** 2) - np.sqrt(e ** 2 + w ** 2)),
             lambda q, v, k, e, w, d: (0.5 * k * (q / d - e) / np.sqrt((q / d - e) ** 2 + w ** 2), 0 * q), parity="none",
@@ -193,7 +198,8 @@ POWER_DAMPER = Term("power_damper", "f*sign(v)*(abs(v)/w)**n",
 
 LOOP = Term("bouc_wen_loop", "k*q",
             (Param("f", "N", "force", meaning="yield force"), Param("k", "N/m", "stiffness", meaning="stiffness of the loop at its start"),
-             Param("g", "", "range", 0.2, 1.5, "share of the bending that dissipates"), Param("n", "", "range", 1.0, 4.0, "sharpness of the knee")),
+             Param("g", "", "range", 0.2, 1.5, "share of the bending that dissipates"),
+             Param("n", "", "range", 1.0, 4.0, "sharpness of the knee")),
             lambda q, v, f, k, g, n: k * q, lambda q, v, f, k, g, n: (k + 0 * q, 0 * q), memory="bouc_wen",
             stiffness=lambda f, k, g, n: k + 0 * f, dissipative=True,
             meaning="Bouc–Wen loop, stated by its yield force")
@@ -212,7 +218,8 @@ HARDENING = (Law(POWER_SPRING, lambda z: _grid(np.array([1.0]), np.array([z.disp
                  ("log", "log", "log"), (0,)))
 SOFTENING = (Law(SATURATING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.5, 1.0, 2.0, 5.0]), np.array([1.0, 2.0])),
                  ("log", "log", "log"), (0,)),
-             Law(FALLING, lambda z: _grid(np.array([1.0]), np.array([z.displacement]), np.array([2.0, 3.0])), ("log", "fixed", "log"), (0,)))
+             Law(FALLING, lambda z: _grid(np.array([1.0]), np.array([z.displacement]), np.array([2.0, 3.0])),
+                 ("log", "fixed", "log"), (0,)))
 _GAPS = np.array([0.5, 1.2, 2.0, 3.0, 4.0, 5.0, 6.0])
 CLEARANCE = (Law(LIBRARY["clearance"], lambda z: _grid(np.array([1.0]), z.displacement * _GAPS), ("log", "log"), (0,)),
              Law(ROUNDED_GAP, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:5], np.array([0.1])), ("log", "log", "log"), (0,)),
@@ -227,7 +234,8 @@ ASYMMETRIC = (Law(ONE_SIDED, lambda z: _grid(np.array([1.0]), np.array([-2.0, -1
               Law(CLOSING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([-3.0, -1.0, 1.0, 3.0])), ("signed", "signed"), (0,),
                   signed=True))
 COULOMB = (Law(FRICTION, lambda z: _grid(np.array([1.0]), z.velocity * np.array([0.003, 0.02, 0.1, 0.3, 1.0])), ("log", "log"), (0,)),
-           Law(SLOW_FRICTION, lambda z: _grid(np.array([1.0]), z.velocity * np.array([0.02, 0.1, 0.4]), np.array([0.4]), np.array([3.0, 10.0])),
+           Law(SLOW_FRICTION, lambda z: _grid(np.array([1.0]), z.velocity * np.array([0.02, 0.1, 0.4]), np.array([0.4]),
+                                        np.array([3.0, 10.0])),
                ("log", "log", "linear", "log"), (0,)))
 QUADRATIC = (Law(POWER_DAMPER, lambda z: _grid(np.array([1.0]), np.array([z.velocity]), np.array([1.6, 2.0, 2.5, 3.0])),
                  ("log", "fixed", "log"), (0,)),)

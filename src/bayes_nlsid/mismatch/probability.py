@@ -9,9 +9,9 @@ or noise of the structure it was fitted on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,16 @@ class Scores:
     dispersion: float = 1.0
     linear: float = 1.0
     held: float = float("nan")
+
+
+def scores_from(stored: Mapping[str, Any]) -> Scores:
+    """Scores as they stand in ``scores.json``."""
+    def number(value: Any) -> float:
+        return float("nan") if value is None else float(value)
+
+    items = tuple(Score(tuple((str(c), str(p)) for c, p in i["key"]),
+                        *(number(i[k]) for k in ("gain", "alone", "strength", "visible", "rest", "held"))) for i in stored["items"])
+    return Scores(items, *(number(stored[k]) for k in ("unexplained", "dispersion", "linear", "held")))
 
 
 def sigmoid(x: float) -> float:

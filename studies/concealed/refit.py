@@ -1,0 +1,51 @@
+"""Fit the layer from scores to probabilities on simulated cases with known answers; the weights go into ``mismatch/probability.py``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from bayes_nlsid.mismatch.probability import BY_HAND, FEATURES, Layer, Scores, fit_layer, probabilities, scores_from
+
+
+def gather(results: Path, answers: Path) -> tuple[list[Scores], list[tuple[tuple[str, str], ...]]]:
+    """Scores and true keys of all cases that have both."""
+    scores, truths = [], []
+    for file in sorted(results.glob("*/scores.json")):
+        sheet = answers / f"{file.parent.name}.json"
+        if sheet.exists():
+            effects = json.loads(sheet.read_text())["effects"]
+            scores.append(scores_from(json.loads(file.read_text())))
+            truths.append(tuple(sorted((e["cls"], e["loc"]) for e in effects)))
+    return scores, truths
+
+
+def log_loss(layer: Layer, scores: list[Scores], truths: list[tuple[tuple[str, str], ...]]) -> float:
+    """Mean of −log p of the truth; a truth that was not weighed counts as ``other``."""
+    total = 0.0
+    for one, truth in zip(scores, truths, strict=True):
+        p = probabilities(one, layer)
+        total -= float(np.log(max(p.get(truth, p.get((("other", "-"),), 0.0)), 1e-6)))
+    return total / max(len(scores), 1)
+
+
+def refit(results: list[Path], answers: list[Path], spread: float = 1.0, folds: int = 5) -> Layer:
+    """Fit on all cases and print the weights, with the log loss on cases left out."""
+    scores: list[Scores] = []
+    truths: list[tuple[tuple[str, str], ...]] = []
+    for result, answer in zip(results, answers, strict=True):
+        more = gather(result, answer)
+        scores, truths = scores + more[0], truths + more[1]
+    left_out = []
+    for k in range(folds):
+        keep = [i for i in range(len(scores)) if i % folds != k]
+        test = [i for i in range(len(scores)) if i % folds == k]
+        layer = fit_layer([scores[i] for i in keep], [truths[i] for i in keep], BY_HAND, "", spread)
+        left_out += [log_loss(layer, [scores[i]], [truths[i]]) for i in test]
+    final = fit_layer(scores, truths, BY_HAND, f"fitted on {len(truths)} simulated cases", spread)
+    print(f"{len(truths)} cases; log loss by hand {log_loss(BY_HAND, scores, truths):.3f}, on cases left out {np.mean(left_out):.3f}, "
+          f"on all {log_loss(final, scores, truths):.3f}")
+    print(", ".join(f"{name.replace(' ', '_')}={weight:.3f}" for name, weight in zip(FEATURES, final.weights, strict=True)))
+    return final
