@@ -136,6 +136,29 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
     return candidates, latents, scale
 
 
+def forced(fam: Family, fit: LinearFit, evidence: Evidence, place: str, size: Size, share: float) -> list[Candidate]:
+    """Every force law at one place, in a middle shape and so strong that it changes the response by ``share`` of it.
+
+    Starts for laws so strong that the motion of the linear model says nothing about them; no gain is promised.
+    """
+    spectra = evidence.spectra
+    top = int(np.argmax(spectra.levels))
+    paths = bed(fit.fields.modes, spectra, fam.places[place][None], fam.shaker)
+    d, v = paths.in_time(paths.linear(top))
+    h = sensor_paths(fam, fit.fields.modes, spectra.s, [place], fit.shape_errors)[:, :, 0]
+    out = []
+    for row in CATALOGUE:
+        for law in row.laws[:1] if row.kind == "force" else ():
+            shapes = law.shapes(size)
+            values = shapes[len(shapes) // 2].copy()
+            force = along_period(law, values, d[:, 0], v[:, 0], paths.dt, paths.periodic)
+            moved = np.linalg.norm(h * paths.to_lines(force[:, None])[spectra.lines])
+            values[list(law.scaled)] *= share * np.linalg.norm(spectra.response[top]) / max(float(moved), 1e-300)
+            out.append(Candidate(Effect(row.name, place, law, values, tuple(p.name for p in law.term.params),
+                                        tuple(p.unit for p in law.term.params)), 0.0))
+    return out
+
+
 def _best_shape(evidence: Evidence, law: Law, shapes: Array, paths: Bed, moved: list[tuple[Array, Array]], j: int, z: Complex,
                 weight: Array, cls: str, place: str) -> Candidate:
     spectra = evidence.spectra

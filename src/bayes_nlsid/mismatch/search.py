@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.effects import Effect
-from bayes_nlsid.mismatch.explain import Candidate, Latent, scan_forces, scan_linear
+from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import refine
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate, everywhere
 
@@ -79,6 +79,12 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         # the leaders also from the other calibrations: a law that was strong has bent some of them
         if other is not begin and singles and _poor(bench, singles[0]):
             singles = _better(singles, [estimate(bench, other, (c,), rounds=3) for c in short[:2]])
+    if not linear_too and latents and singles and singles[0].misfit_records > 2 * bench.evidence.values:
+        say("trying strong laws where a free force explains most")
+        where = max(latents, key=lambda x: x.explained).place
+        starts = forced(bench.family, fit, bench.evidence, where, bench.sizes[where], 0.4)
+        tried = sorted((estimate(bench, fit, (c,), rounds=1) for c in starts), key=lambda h: h.cost)[:2]
+        singles = _better(singles, [estimate(bench, h.fit, _lead(h), rounds=3) for h in tried])
     singles = _again(bench, singles, places, none, say)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
