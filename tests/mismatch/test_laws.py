@@ -75,7 +75,7 @@ def test_a_stretch_solves_its_equation() -> None:
     zero = np.zeros_like(nodes(1.0))
     tables = np.array([[laws[0](nodes(1e-3)), zero], [zero, laws[1](nodes(1.0))]])
     g = np.zeros((n, 2))
-    assert solve_window(q0, v0, K, V, tables, reach, g) == 0
+    assert solve_window(q0, v0, K, V, tables, reach, g, np.zeros((2, n))) == 0
     q = q0 - np.array([sum(K[:, :, i - k] @ g[k] for k in range(i + 1)) for i in range(n)])
     v = v0 - np.array([sum(V[:, :, i - k] @ g[k] for k in range(i + 1)) for i in range(n)])
     wanted = np.stack([laws[0](q[:, 0]), laws[1](v[:, 1])], axis=1)

@@ -253,7 +253,7 @@ def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 38
             old, w = g[here].copy(), min(window, n - first)
             padded = np.fft.rfft(np.concatenate([old, np.zeros((2 * window - w, J))]), axis=0)
             own = [np.fft.irfft(_mul(k, padded), 2 * window, axis=0)[:w] for k in short]
-            solve_window(d[here] + own[0], v[here] + own[1], *near, tables, reach, g[here])
+            solve_window(d[here] + own[0], v[here] + own[1], *near, tables, reach, g[here], np.zeros((J, w)))
             step = np.zeros((n, J))
             step[here] = g[here] - old
             spectrum = np.fft.rfft(step, axis=0)

@@ -183,6 +183,9 @@ def noise_density(case: Case, steady: Spectra | None, points: int = 257) -> tupl
         power = (np.abs(np.fft.rfft(piece, axis=0)) ** 2)[1:] / block
         position = np.arange(1, len(power) + 1) / (block / 2)
         how = "quietest stretch of the longest record"
+    if how != "scatter between periods":
+        # a variance from m values makes what is divided by it m/(m − 1) times too large on average
+        power = local_mean(power, max(6, len(power) // 64))
     edges = np.linspace(0, 1, points + 1)
     out = np.empty((points, power.shape[1]))
     previous = power[:max(3, len(power) // points)].mean(0)

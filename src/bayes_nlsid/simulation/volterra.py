@@ -49,7 +49,7 @@ def _force(tables: np.ndarray, reach: np.ndarray, j: int, q: float, v: float) ->
 
 @kernel
 def solve_window(q0: np.ndarray, v0: np.ndarray, kernel_q: np.ndarray, kernel_v: np.ndarray, tables: np.ndarray, reach: np.ndarray,
-                 g: np.ndarray) -> int:
+                 g: np.ndarray, past: np.ndarray) -> int:
     """Forces of one stretch.
 
     Parameters
@@ -64,6 +64,8 @@ def solve_window(q0: np.ndarray, v0: np.ndarray, kernel_q: np.ndarray, kernel_v:
         Largest arguments of the tables.
     g : ndarray (n, J)
         Filled: N.
+    past : ndarray (J, n)
+        Scratch: forces, newest first from the end, so that sums run forward in memory.
 
     Returns
     -------
@@ -72,7 +74,6 @@ def solve_window(q0: np.ndarray, v0: np.ndarray, kernel_q: np.ndarray, kernel_v:
     """
     n, places = q0.shape
     lost, largest = 0, 1e-300
-    past = np.zeros((places, n))                       # forces, newest first from the end, so that sums run forward in memory
     for i in range(n):
         for j in range(places):
             g[i, j] = g[i - 1, j] if i else 0.0
