@@ -37,8 +37,9 @@ class Regression:
         2ζω and ω² of every free mode, then linear coefficients.
     base : ndarray (n,)
         What no parameter changes.
-    matrices : tuple of ndarray (n, M)
-        For each piece of the problem: its force from the values of its law (``values_of``); empty where pieces are evaluated exactly.
+    matrices : tuple of ndarray (m, M)
+        For each piece of the problem: the first m entries of its force from the values of its law (``law_values``), the others being zero;
+        empty where pieces are evaluated exactly.
     root : ndarray (N,) or None
         Square roots of the weights where the entries are those of the problem; None where they are condensed.
     """
@@ -58,11 +59,12 @@ class Regression:
         """(B, n) of theta (B, P)."""
         out = np.zeros((len(theta), self.size))
         for i, piece in enumerate(self.problem.pieces):
-            out += self._force(i, piece.values(theta))
+            part = self._force(i, piece.values(theta))
+            out[:, :part.shape[1]] += part
         return out
 
     def _force(self, index: int, values: Array) -> Array:
-        """Weighted force (B, n) of one piece for parameters of its term (B, n_p)."""
+        """Weighted force (B, n), without zeros at its end, of one piece for parameters of its term (B, n_p)."""
         piece, seen = self.problem.pieces[index], self.problem.observed
         if self.root is None:
             return law_values(self.problem, piece, values) @ self.matrices[index].T
@@ -72,7 +74,7 @@ class Regression:
         """Derivative (B, n, K) of ``forces`` by the nonlinear search coordinates of s (B, P); steps inside the box, one piece at a time."""
         width = high - low
         free = [i for piece in self.problem.pieces for i in piece.columns]
-        out = np.empty((len(s), self.size, len(free)))
+        out = np.zeros((len(s), len(free), self.size))
         at = 0
         for i, piece in enumerate(self.problem.pieces):
             columns = list(piece.columns)
@@ -83,13 +85,13 @@ class Regression:
             values = piece.values(self.problem.to_theta(rows))
             if self.root is None:    # differences of the laws first: a fifth of the products
                 law = law_values(self.problem, piece, values)
-                slope = ((law[:, 1:] - law[:, :1]) / move[:, :, None]) @ self.matrices[i].T
+                matrix = self.matrices[i]
+                out[:, at:at + count, :len(matrix)] = ((law[:, 1:] - law[:, :1]) / move[:, :, None]) @ matrix.T
             else:
                 force = self._force(i, values.reshape(-1, values.shape[-1])).reshape(len(s), count + 1, self.size)
-                slope = (force[:, 1:] - force[:, :1]) / move[:, :, None]
-            out[:, :, at:at + count] = slope.transpose(0, 2, 1)
+                out[:, at:at + count] = (force[:, 1:] - force[:, :1]) / move[:, :, None]
             at += count
-        return out
+        return out.transpose(0, 2, 1)
 
     def linear_coefficients(self, theta: Array) -> Array:
         """(B, L) of theta (B, P): what ``columns`` are multiplied by."""
@@ -149,7 +151,8 @@ class Condensed:
         at = linear + 1
         for labels in laws:
             width = sum(self.labels[label][1] for label in labels)
-            matrices.append(np.ascontiguousarray(own[:, at:at + width]))
+            used = np.flatnonzero(own[:, at:at + width].any(axis=1))
+            matrices.append(np.ascontiguousarray(own[:used[-1] + 1 if len(used) else 0, at:at + width]))
             at += width
         return Regression(problem, own[:, :linear].copy(), own[:, linear].copy(), tuple(matrices), None)
 
@@ -256,8 +259,9 @@ class _Columns:
         """Term, locations and excess of every linear coefficient and every stuck spring."""
         problem = self.problem
         out: dict[Hashable, tuple[Term, tuple[str, ...], bool]] = {}
+        parameters = problem.model.parameters
         for i in problem.linear_index:
-            entry = problem.model.parameters[i]
+            entry = parameters[i]
             if entry.element >= 0:
                 element = problem.model.elements[entry.element]
                 out["linear", entry.name] = element.term, element.groups[entry.group], element.excess
@@ -339,9 +343,10 @@ def _own_vectors(problem: Problem, cell: Cell) -> dict[Hashable, Array]:
     for k in problem.model.free_modes:
         own = 1.0 if k == cell.equation else 0.0
         out["velocity", k], out["displacement", k] = own * seen.velocity[here], own * seen.displacement[here]
+    parameters = problem.model.parameters
     for i, column in zip(problem.linear_index, problem.columns, strict=True):
-        if problem.model.parameters[i].element < 0:
-            out["linear", problem.model.parameters[i].name] = column[here]
+        if parameters[i].element < 0:
+            out["linear", parameters[i].name] = column[here]
     return out
 
 

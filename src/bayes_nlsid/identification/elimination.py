@@ -81,11 +81,12 @@ class Elimination:
 
     def project(self, slope: NDArray[np.float64], held: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Part of slope (B, n, K) orthogonal to the columns that are not held (B, L)."""
-        inside = self.q.T @ slope
+        rows = slope.transpose(0, 2, 1)    # as the derivatives lie in memory
+        inside = rows @ self.q
         for i in np.flatnonzero(held.any(axis=1)):
             basis = np.linalg.qr(self.r[:, ~held[i]])[0]
-            inside[i] = basis @ (basis.T @ inside[i])
-        return slope - self.q @ inside
+            inside[i] = (inside[i] @ basis) @ basis.T
+        return (rows - inside @ self.q.T).transpose(0, 2, 1)
 
     def _bounded(self, right: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         for _ in range(3):   # the box of 2ζω depends on ω; ω moves by parts in a thousand, so this settles at once
