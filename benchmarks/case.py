@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +64,7 @@ def recording(samples: int, seed: int = 0) -> ModalData:
     envelope = 2 * np.pi * 1.3 * t[-1] ** -1
     for k, w in enumerate(model.omega):
         for share, factor in ((1.0, 0.985), (0.6, 1.011)):
-            phase, size = rng.uniform(0, 2 * np.pi), share * 2.6e-3 * (FREQUENCY[0] / FREQUENCY[k]) ** 1.5
+            phase, size = rng.uniform(0, 2 * np.pi), share * 3.9e-3 * (FREQUENCY[0] / FREQUENCY[k]) ** 1.5
             for turn, part in ((0.0, 0.6), (envelope, 0.2), (-envelope, 0.2)):
                 rate = w * factor + turn
                 u[:, k] += size * part * np.sin(rate * t + phase)
@@ -90,8 +92,30 @@ def joints(name: str) -> Element:
     return Element(LIBRARY[name], JOINTS)
 
 
-def seconds(run: Callable[[], object]) -> float:
-    """CPU time of this thread, s."""
-    start = time.thread_time()
-    run()
-    return time.thread_time() - start
+def seconds(run: Callable[[], object], rounds: int = 1) -> float:
+    """CPU time of this thread, s; with several rounds the smallest of them, after one to warm up."""
+    times = []
+    for i in range(rounds + (rounds > 1)):
+        start = time.thread_time()
+        run()
+        if i or rounds == 1:
+            times.append(time.thread_time() - start)
+    return min(times)
+
+
+@final
+@dataclass(frozen=True)
+class Row:
+    """One line of the results: number in the table of aims, what, the aim, what was measured; ``met`` is None where there is no aim."""
+
+    number: str
+    what: str
+    aim: str
+    measured: str
+    met: bool | None = None
+
+
+def quick(value: float) -> str:
+    """A time in the unit that fits."""
+    scale, unit = next(((k, u) for k, u in ((1, "s"), (1e-3, "ms"), (1e-6, "µs")) if abs(value) >= k), (1e-9, "ns"))
+    return f"{value / scale:.3g} {unit}"

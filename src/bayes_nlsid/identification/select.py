@@ -182,7 +182,7 @@ class _Search:
 
 def select(problem: Problem, candidates: Sequence[Element], *, eps1: float | None = None, eps2: float | None = None, starts: int = 50,
            seed: int = 0, weights: NDArray[np.float64] | None = None, most: int = 6, workers: int = 1,
-           progress: Progress | None = None) -> Selection:
+           progress: Progress | None = None, shared: Condensed | None = None) -> Selection:
     """Choose elements one by one, then drop what is not needed.
 
     Forward: every remaining candidate is added to the current model, everything refitted from the last values, and the one
@@ -215,6 +215,8 @@ def select(problem: Problem, candidates: Sequence[Element], *, eps1: float | Non
         Threads; the result does not depend on it.
     progress : callable or None
         Called with the share done and a sentence.
+    shared : Condensed or None
+        What ``condensed_for`` gave for the same problem, candidates and weights; None works it out.
 
     Raises
     ------
@@ -225,7 +227,7 @@ def select(problem: Problem, candidates: Sequence[Element], *, eps1: float | Non
     if len(named) != len(candidates):
         raise ValueError(f"two candidates share a name: {sorted(key(c) for c in candidates)}")
     weights = problem.default_weight if weights is None else weights
-    shared = _shared(problem, candidates, weights)
+    shared = condensed_for(problem, candidates, weights) if shared is None else shared
     search = _Search(problem, eps1, eps2, starts, seed, weights, workers, progress, shared)
     linear = fit(problem, starts=starts, seed=seed, weights=weights, shared=shared)
     chosen, current, path, tried = _forward(search, named, linear, most)
@@ -237,7 +239,7 @@ def select(problem: Problem, candidates: Sequence[Element], *, eps1: float | Non
     return Selection(tuple(named[x] for x in chosen), tuple(named[x] for x in kept), tuple(path), tuple(tried), final, linear.mse)
 
 
-def _shared(problem: Problem, candidates: Sequence[Element], weights: NDArray[np.float64]) -> Condensed | None:
+def condensed_for(problem: Problem, candidates: Sequence[Element], weights: NDArray[np.float64]) -> Condensed | None:
     """Columns of the problem and of all candidates that tables can hold, condensed once, so that no fit walks through the recordings."""
     known = {(e.term.name, name) for e in problem.model.elements for name in e.locations}
     fitting: list[Element] = []
