@@ -59,7 +59,7 @@ def roofline(step: float) -> str:
         "| kernel | operations | bytes | bound | measured | |", "| --- | ---: | ---: | ---: | ---: | ---: |",
         f"| condensed HHT step, one sample, without the joint laws | {STEP_PRODUCTS} flops | 8 stored, if asked for | {quick(bound)} "
         f"| {quick(step)} with the laws | {step / bound:.1f}x |",
-        f"| condensed log-likelihood, five joints, 128 places | {LIKELIHOOD} flops | 3.3 MB of matrices, read once for all walkers "
+        f"| condensed log-likelihood, five joints, 128 places | {LIKELIHOOD} flops at most | 3.3 MB of matrices, read once for all walkers "
         f"| {quick(LIKELIHOOD / flops)} | row 6 | |"])
 
 
