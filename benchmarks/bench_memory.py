@@ -33,10 +33,9 @@ def nothing() -> None:
 
 def averaging(term: str) -> None:
     """Backbone band by averaging."""
-    from benchmarks.bench_simulation import beam
-
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.fast import fast_bands
+    from benchmarks.bench_simulation import beam
 
     found = fast_bands(_draws(SAMPLES, 4), beam(LIBRARY[term]), at="tip", start_amplitude=START, stop_amplitude=FLOOR)
     assert found.status == {"ok": SAMPLES}, found.status
@@ -44,10 +43,9 @@ def averaging(term: str) -> None:
 
 def integrated(term: str, width: int = 4) -> None:
     """Backbone band by time integration of every sample, HHT at 8192 Hz, from 4 mm down to 10 µm."""
-    from benchmarks.bench_simulation import FS, beam
-
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.bands import backbone_bands
+    from benchmarks.bench_simulation import FS, beam
 
     found = backbone_bands(_draws(SAMPLES, width), beam(LIBRARY[term]), at="tip", start_amplitude=START, stop_amplitude=FLOOR, fs=FS)
     assert found.status == {"ok": SAMPLES}, found.status
@@ -57,10 +55,9 @@ def swept(term: str) -> None:
     """Response curves at one level."""
     from dataclasses import replace
 
-    from benchmarks.bench_simulation import beam
-
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.response_bands import response_bands
+    from benchmarks.bench_simulation import beam
 
     model = beam(LIBRARY[term])
     model = replace(model, linear=replace(model.linear, inputs=("tip",)))
@@ -70,13 +67,12 @@ def swept(term: str) -> None:
 
 def scattered() -> None:
     """Monte Carlo of twenty parameters: 1,024 samples for the band, 11,264 more for the indices."""
-    from benchmarks.bench_simulation import JOINT, beam
-
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.inference.prior import Prior
     from bayes_nlsid.prediction.montecarlo import Decay, backbones
     from bayes_nlsid.prediction.sampling_plan import scattered_plan
     from bayes_nlsid.prediction.sensitivity import sobol
+    from benchmarks.bench_simulation import JOINT, beam
 
     model, centre = beam(LIBRARY["iwan4"]), np.tile(JOINT, 5)
     spreads = [(i, Prior(name, parameter.unit, "normal", float(min(0.6 * c, 1.4 * c)), float(max(0.6 * c, 1.4 * c)), float(c),
