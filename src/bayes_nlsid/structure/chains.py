@@ -9,6 +9,9 @@ import numpy as np
 from bayes_nlsid.structure.modal import ModalModel
 from bayes_nlsid.structure.structure import Structure
 
+FREE = 1e-4
+"""rad/s: the frequency that stands for no stiffness."""
+
 
 def oscillator(*, mass: float = 1.0, stiffness: float | None = None, frequency: float | None = None, damping: float | None = None,
                zeta: float | None = None, location: str = "J1", sensors: Sequence[str] = (), inputs: Sequence[str] = ()) -> ModalModel:
@@ -21,7 +24,7 @@ def oscillator(*, mass: float = 1.0, stiffness: float | None = None, frequency: 
     mass : float
         kg.
     stiffness, frequency : float
-        N/m or Hz; exactly one.
+        N/m or Hz; exactly one. A stiffness of zero is a free mass, a drive for instance: its frequency is set to `FREE`, too low to matter.
     damping, zeta : float
         N s/m or damping ratio; at most one, none means undamped.
     location : str
@@ -38,9 +41,11 @@ def oscillator(*, mass: float = 1.0, stiffness: float | None = None, frequency: 
         raise ValueError("oscillator: give either stiffness (N/m) or frequency (Hz)")
     if damping is not None and zeta is not None:
         raise ValueError("oscillator: give either damping (N s/m) or zeta (ratio), not both")
-    if mass <= 0 or (stiffness or frequency or 0.0) <= 0:
+    if mass <= 0 or (stiffness is None and (frequency or 0.0) <= 0) or (stiffness or 0.0) < 0:
         raise ValueError(f"oscillator: mass {mass} and stiffness {stiffness} or frequency {frequency} must be positive")
-    omega = np.sqrt(stiffness / mass) if stiffness is not None else 2 * np.pi * float(frequency or 0.0)
+    if stiffness == 0 and zeta is not None:
+        raise ValueError("oscillator: a mass without stiffness has no damping ratio; give damping (N s/m)")
+    omega = max(np.sqrt(stiffness / mass), FREE) if stiffness is not None else 2 * np.pi * float(frequency or 0.0)
     ratio = zeta if zeta is not None else (damping or 0.0) / (2 * mass * omega)
     if not 0 <= ratio < 1:
         raise ValueError(f"oscillator: damping must not be negative and below critical, got ratio {ratio:g}")

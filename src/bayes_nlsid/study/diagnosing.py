@@ -28,9 +28,6 @@ def run_diagnosis(path: Path | str, out: Path | str, *, seed: int = 0, reporter:
         If the case cannot be used, or ``out`` cannot be written.
     """
     case, folder = Path(path), Path(out)
-    if case.is_file():
-        raise InputError(str(case), "is a file; the mismatch engine of this version reads case folders",
-                         "give the folder that holds case.json, nominal.npz and the records")
     if folder.exists() and not folder.is_dir():
         raise InputError(str(folder), "the output folder is a file", "choose another --out")
     try:
@@ -45,7 +42,7 @@ def _carry_out(case: Path, folder: Path, seed: int, reporter: Reporter | None) -
     """Diagnose and write, with the folder held."""
     told = reporter if reporter is not None else Reporter((folder / "run.log",))
     told.begin(1, 2, "diagnose", str(case))
-    found = diagnose(case, seed, lambda sentence: told.update(0.0, sentence))
+    found = _diagnosed(case, seed, told)
     told.end(found.seconds, reused=False)
     told.begin(2, 2, "report", "always written anew")
     write_diagnosis(found, folder)
@@ -55,6 +52,26 @@ def _carry_out(case: Path, folder: Path, seed: int, reporter: Reporter | None) -
     write_atomic(folder / "report.html", _page(found, pictures).encode())
     told.end(0.0, reused=False)
     return found
+
+
+def _diagnosed(path: Path, seed: int | None, told: Reporter) -> Diagnosis:
+    """A study goes to the engine for recordings of any kind; so does a case folder whose records are not what its own engine needs."""
+    from bayes_nlsid.mismatch.recorded_answer import diagnose_campaign
+
+    if path.is_dir():
+        from bayes_nlsid.mismatch.case_campaign import campaign_from_case, needs_general
+
+        if not needs_general(path):
+            return diagnose(path, seed or 0, lambda sentence: told.update(0.0, sentence))
+        campaign = campaign_from_case(path)
+    else:
+        from bayes_nlsid.study.campaigns import campaign_of
+        from bayes_nlsid.study.reading import read_study
+
+        study = read_study(path)
+        seed = study.seed if seed is None else seed
+        campaign = campaign_of(study)
+    return diagnose_campaign(campaign, seed or 0, told.update)
 
 
 def _pictures(found: Diagnosis) -> dict[str, tuple[bytes, str]]:

@@ -131,7 +131,10 @@ def _oscillator(table: Table) -> StructureEntry:
         raise table.wrong("stiffness", "and frequency must not both be given or both be missing", "give one of them")
     if table.has("damping") and table.has("zeta"):
         raise table.wrong("damping", "and zeta are both given", "keep one of them")
-    values = {"mass": mass, "stiffness": table.number("stiffness", "stiffness", None, positive=True),
+    stiffness = table.number("stiffness", "stiffness", None)
+    if stiffness is not None and stiffness < 0:
+        raise table.wrong("stiffness", f"is {stiffness:g}", "give a positive value, or 0 for a mass that moves freely")
+    values = {"mass": mass, "stiffness": stiffness,
               "frequency": table.number("frequency", "frequency", None, positive=True), "damping": table.number("damping", "damping", None),
               "zeta": table.number("zeta", "ratio", None), "location": table.text("location", "x"), "sensors": table.texts("sensors", None),
               "inputs": table.texts("inputs", None)}
