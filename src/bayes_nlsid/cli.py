@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     check = add("check", "read everything, say what would be done and what is missing; compute nothing", _check)
     check.add_argument("study", metavar="STUDY.toml")
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
-    diagnose.add_argument("study", metavar="PATH", help="case folder")
+    diagnose.add_argument("study", metavar="PATH", help="study file, or case folder")
     for name, what in (("compare", "scenarios S1–S3 and alternatives scored on records that none of them was fitted to"),
                        ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
                        ("frf", "stepped-sine response curves with posterior bands")):
@@ -222,7 +222,7 @@ def _diagnose(options: argparse.Namespace) -> int:
     from bayes_nlsid.study.diagnosing import lines, run_diagnosis
 
     out = Path(options.out)
-    found = run_diagnosis(options.study, out, seed=options.seed or 0, reporter=_reporter(options, out))
+    found = run_diagnosis(options.study, out, seed=options.seed, reporter=_reporter(options, out))
     if not options.quiet:
         print(lines(found) + f"\n\nin {out}: report.html, diagnosis.json, predictions.npz, figures/")
     return REFUSED if found.verdict == "cannot_tell" else DONE

@@ -61,8 +61,8 @@ def test_cannot_tell_is_a_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "cannot_tell" in capsys.readouterr().out
 
 
-def test_a_file_is_not_a_case(tmp_path: Path) -> None:
+def test_a_study_that_says_nothing_is_refused_in_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text("")
-    with pytest.raises(InputError, match="reads case folders"):
+    with pytest.raises(InputError, match="study.toml"):
         diagnosing.run_diagnosis(tmp_path / "study.toml", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out" / "diagnosis.json").exists()

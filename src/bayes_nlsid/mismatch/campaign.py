@@ -124,13 +124,32 @@ def decimated(recording: Recording, top: float) -> Recording:
     n = len(signals)
     far = 0 if periodic else min(n - 1, int(16 * recording.fs / top))
     padded = _continued(signals, far) if far else signals
-    f = np.fft.rfftfreq(len(padded), recording.dt)
+    f = np.asarray(np.fft.rfftfreq(len(padded), recording.dt), dtype=np.float64)
     gain = 1 - smooth_step(f, min(top, 0.99 * stop), stop)
     low = np.fft.irfft(np.fft.rfft(padded, axis=0) * gain[:, None], n=len(padded), axis=0)[far:far + n][::step]
     low = low[:n // step] if periodic else low
     s = recording.response.shape[1]
     return replace(recording, dt=recording.dt * step, response=low[:, :s], force=low[:, s:],
                    period=None if recording.period is None else recording.period // step)
+
+
+def parted(recording: Recording, share: float) -> tuple[Recording, Recording, Recording | None]:
+    """A record in time: what is fitted, what judges, and a quiet end, where a transient has died away, that shows the noise.
+
+    Without the last step the end of a decay would judge every model by noise alone.
+    """
+    whole = recording.n * recording.dt
+    blocks = np.array_split(recording.response - recording.response[-(recording.n // 20 + 1):].mean(axis=0), 40)
+    loud = np.array([np.sqrt(np.mean((b / np.maximum(np.abs(recording.response).max(axis=0), 1e-300)) ** 2)) for b in blocks])
+    quiet = np.median(loud[-5:])
+    alive = np.flatnonzero(loud > 4 * quiet)
+    end, rest = whole, None
+    # dead at the end: no more change there, and far below the beginning
+    if alive.size and alive[-1] < 35 and loud.max() > 20 * quiet and loud[-5:].max() < 1.5 * loud[-5:].min():
+        end = (alive[-1] + 1) / 40 * whole
+        rest = recording.window((alive[-1] + 3) / 40 * whole, whole)
+    cut = share * end
+    return recording.window(0.0, cut), recording.window(cut, end), rest
 
 
 def _continued(signals: Array, far: int) -> Array:

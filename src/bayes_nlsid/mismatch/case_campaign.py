@@ -7,6 +7,7 @@ used is left out with a sentence; only a case without a model or without any rec
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.mismatch.campaign import MOST, PASS, Campaign, Trial, Use, campaign_notes, energetic_band, in_band, make_trial
+from bayes_nlsid.mismatch.campaign import MOST, PASS, Campaign, Trial, Use, campaign_notes, energetic_band, in_band, make_trial, parted
 from bayes_nlsid.mismatch.case import CLASSES, TOLERANCES, _json, _kind, _load, _under
 from bayes_nlsid.recordings.checks import check
 from bayes_nlsid.recordings.noise import noise_psd
@@ -32,6 +33,8 @@ def needs_general(path: str | Path) -> bool:
     """Whether the engine for periodic campaigns cannot use a case folder: no two open records of steady periods or bursts from rest with a
     measured force, a stiffness that is not positive definite, no band, or motion measured otherwise than as acceleration."""
     folder = Path(path)
+    if not (folder / "case.json").is_file():
+        return False   # the other reader says what is missing
     meta = _json(folder / "case.json")
     try:
         with np.load(folder / "nominal.npz", allow_pickle=False) as store:
@@ -132,7 +135,8 @@ def _model(folder: Path, meta: dict[str, Any], notes: list[str]) -> tuple[ModalM
     size = len(M)
     for name, matrix in (("M", M), ("K", K)):
         if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-            raise InputError(f"{path}: {name}", f"has shape {matrix.shape} or is not finite, expected {(size, size)}", "store square matrices")
+            raise InputError(f"{path}: {name}", f"has shape {matrix.shape} or is not finite, expected {(size, size)}",
+                             "store square matrices")
     try:
         values, vectors = eigh((K + K.T) / 2, (M + M.T) / 2)
     except np.linalg.LinAlgError:
@@ -140,8 +144,8 @@ def _model(folder: Path, meta: dict[str, Any], notes: list[str]) -> tuple[ModalM
     scale = float(np.abs(values).max()) or 1.0
     negative = values < -1e-9 * scale
     if negative.any():
-        notes.append(f"The stiffness matrix is not positive definite: {int(negative.sum())} of its modes would grow by themselves; they were "
-                     "taken as rigid-body modes.")
+        notes.append(f"The stiffness matrix is not positive definite: {int(negative.sum())} of its modes would grow by themselves; they "
+                     "were taken as rigid-body modes.")
     rigid = values <= 1e-12 * scale
     omega = np.where(rigid | negative, FREE, np.sqrt(np.maximum(values, FREE ** 2)))
     zeta = np.full(size, float(meta.get("nominal_damping_ratio") or 0.01))
@@ -206,7 +210,8 @@ def _record(name: str, entry: dict[str, Any], raw: dict[str, NDArray[Any]], meta
     response = response.reshape(len(response), -1)
     n = len(response)
     if response.shape[1] != len(sensors) or n < 64 or (force is not None and len(force) != n):
-        notes.append(f"Record {name} has {response.shape[1]} channels of {n} samples where {len(sensors)} sensors are stated; it was left out.")
+        notes.append(f"Record {name} has {response.shape[1]} channels of {n} samples where {len(sensors)} sensors are stated; "
+                     "it was left out.")
         return None
     time = np.asarray(raw["time"], dtype=float).reshape(-1) if "time" in raw else np.arange(n) / float(meta.get("fs_hz") or 1.0)
     dt = float((time[-1] - time[0]) / (n - 1)) if len(time) == n else 1 / float(meta.get("fs_hz") or 1.0)
@@ -253,10 +258,15 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
         if use != "fit" or periods == 1:
             out.append((recording, use))
             continue
+        if not periods:
+            first, second, quiet = parted(recording, SPLIT)
+            out += [(first, "fit"), (replace(second, name=f"{second.name} (rest)"), "judge")]
+            if quiet is not None and quiet.n >= 64 and not any(use == "noise" for _, use in out):
+                out.append((quiet, "noise"))
+            continue
         whole = recording.n * recording.dt
-        cut = max(1, round(SPLIT * periods)) * (recording.period or 0) * recording.dt if periods else SPLIT * whole
-        cut = min(cut, whole - (recording.period or 0) * recording.dt) if periods else cut
-        out += [(recording.window(0.0, cut), "fit"), (recording.window(cut, whole), "judge")]
+        cut = min(max(1, round(SPLIT * periods)), periods - 1) * (recording.period or 0) * recording.dt
+        out += [(recording.window(0.0, cut), "fit"), (replace(recording.window(cut, whole), name=f"{recording.name} (rest)"), "judge")]
     notes.append(f"Few open records: the last {100 * (1 - SPLIT):.0f} % of each was not fitted but kept to judge by.")
     return out
 

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces import laws
+from bayes_nlsid.forces.parameter import Param
+from bayes_nlsid.forces.term import Term
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.catalogue import OFFSET
 from bayes_nlsid.mismatch.innovations import Drive, Linear, observer_of
 from bayes_nlsid.mismatch.observer import observe
 from bayes_nlsid.mismatch.prove import envelope
@@ -29,6 +32,11 @@ START_CYCLES = 6     # of the slowest mode, from which an unknown start is estim
 AT_REST = 0.03
 SAMPLES = 12_000     # of all records that a re-estimation simulates
 SHIFT = 1e-5
+CLOSE = 4e-3         # error of the integrator, relative, that is accepted here
+OFFSET = Term("constant", "f", (Param("f", "N", "coefficient", meaning="constant force"),), partial(laws.displacement_even, power=0.0),
+              partial(laws.displacement_even_slope, power=0.0), parity="even",
+              meaning="constant force: offset of a force channel, weight, static load")
+"""c |q|^0, a law that the compiled loop knows."""
 COMPILED = True      # many runs follow each other
 
 
@@ -103,14 +111,14 @@ def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[floa
     model = Model(base, tuple(elements), tuple(range(base.modes)), forced)
     rigid = base.omega < RIGID
     move = "log" if freed else "held"
-    kind = [*("held" if r else move for r in rigid), *[move] * base.modes, *(["log" if freed else "held"] if forced else []), *kinds]
+    moves = [*("held" if r else move for r in rigid), *[move] * base.modes, *([move] if forced else []), *kinds]
     if not freed and forced:
-        kind[2 * base.modes + 1] = "held"
+        moves[2 * base.modes + 1] = "held"
     theta = np.concatenate([base.omega / (2 * np.pi), base.zeta, [linear.gain] if forced else [], values])
     unit = np.concatenate([np.ones(2 * base.modes + (1 if forced else 0)), units])
     if forced:
         unit[2 * base.modes + 1] = 1.0
-    return Extended(model, theta, tuple(kind), unit, np.zeros(channels), np.zeros((len(theta), len(theta))), suspects=tuple(suspects))
+    return Extended(model, theta, tuple(moves), unit, np.zeros(channels), np.zeros((len(theta), len(theta))), suspects=tuple(suspects))
 
 
 @final
@@ -144,7 +152,7 @@ def task_of(linear: Linear, drive: Drive, trial: Trial, ext: Extended, most: int
         record = replace(record, period=None)
     u, v = (None, None) if start is None else np.split(start, 2)
     found = predict_record(ext.model, ext.theta[None], record if record.period else record.window(0.0, min(record.n, 4000) * record.dt),
-                           u0=u, v0=v, compiled=COMPILED)
+                           u0=u, v0=v, tolerance=CLOSE, compiled=COMPILED)
     return Task(trial, record, weight, start, spread, found.substeps)
 
 
@@ -196,7 +204,7 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
     list of ndarray (n, s)
         Simulated channels of the fitted records.
     """
-    trials = campaign.used("fit")
+    trials = simulated(campaign)
     most = max(1500, SAMPLES // len(trials))
     try:
         tasks = [task_of(linear, drive, t, ext, most) for t in trials]
@@ -229,6 +237,19 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
     covariance = np.zeros_like(ext.covariance)
     covariance[np.ix_(moving, moving)] = _covariance(slope, residual, P)
     return replace(ext, theta=theta, offset=offset, covariance=covariance, status=status), [w[0] + offset for w in waves]
+
+
+def simulated(campaign: Campaign) -> tuple[Trial, ...]:
+    """Fitted records that are simulated: all but periodic ones, loudest first, as many as the budget of samples admits (one at least)."""
+    trials = sorted(campaign.used("fit"), key=lambda t: -t.level)
+    chosen: list[Trial] = []
+    spent = 0
+    for t in trials:
+        cost = t.recording.period or 0
+        if not chosen or spent + cost <= SAMPLES:
+            chosen.append(t)
+            spent += cost
+    return tuple(t for t in campaign.used("fit") if t in chosen)
 
 
 def _constant(difference: Array, weight: Array) -> Array:

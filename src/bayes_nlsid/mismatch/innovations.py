@@ -235,9 +235,10 @@ def _evened(linear: Linear, desks: Sequence[Desk], taps: bool, drive: Drive) -> 
             s = len(d.trial.recording.channels)
             count = (d.n - d.skip) * s
             block = bench.block[at:at + count:s]
-            power = np.bincount(block - block[0], weights=(left[at:at + count].reshape(-1, s) ** 2).sum(1)) / (s * np.bincount(block - block[0]))
+            label = block - block[0]
+            power = np.bincount(label, weights=(left[at:at + count].reshape(-1, s) ** 2).sum(1)) / (s * np.bincount(label))
             level = np.sqrt(power)
-            weight = d.weight / np.maximum(level, 1e-3 * level.max() + 1e-300)[block - block[0]]
+            weight = d.weight / np.maximum(level, 1e-3 * level.max() + 1e-300)[label]
             out.append(replace(d, weight=weight))
             at += count
         desks = out
@@ -302,8 +303,8 @@ def _desk(trial: Trial, smoothed: Smoothed, force: Array, observer: Observer, to
     skip = int(min(observer.memory + order, trial.recording.n // 5))
     shape = filters[:, :, None]
     return Desk(trial, replace(smoothed, innovations=_filtered(smoothed.innovations, filters, root, N)), force, N,
-                np.einsum("rs,lsm->lrm", root, shape * to_force), np.einsum("rs,lsm->lrm", root, shape * to_channel), skip, min(1.0, 2.25 * top * trial.recording.dt),
-                np.ones(trial.recording.n - skip))
+                np.einsum("rs,lsm->lrm", root, shape * to_force), np.einsum("rs,lsm->lrm", root, shape * to_channel), skip,
+                min(1.0, 2.25 * top * trial.recording.dt), np.ones(trial.recording.n - skip))
 
 
 def _filtered(e: Array, filters: Complex | Array, root: Array, N: int) -> Array:
@@ -348,7 +349,8 @@ def _assemble(linear: Linear, desks: Sequence[Desk], taps: bool, drive: Drive) -
     coefficients = sd * (right.T @ ((left.T @ target) / values))
     block = _blocks(linear, desks)
     part = np.concatenate([np.full((d.n - d.skip) * len(d.trial.recording.channels), d.part) for d in desks])
-    return Bench(linear, tuple(desks), e, np.ascontiguousarray(basis), block, np.bincount(block, weights=part), tuple(names), coefficients,
+    return Bench(linear, tuple(desks), e, np.ascontiguousarray(basis), block,
+                 np.asarray(np.bincount(block, weights=part), dtype=np.float64), tuple(names), coefficients,
                  drive)
 
 

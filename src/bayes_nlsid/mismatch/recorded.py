@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.forward import Extended, estimate, extended, predict
+from bayes_nlsid.mismatch.forward import Extended, estimate, extended, predict, simulated
 from bayes_nlsid.mismatch.innovations import Bench, Drive, Linear, lay_out
 from bayes_nlsid.mismatch.observer import Modal
 from bayes_nlsid.mismatch.odds import Key, odds_of
@@ -26,7 +26,7 @@ from bayes_nlsid.mismatch.weigh import Scale, Weighed, doubles, scale_of, weigh
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 RETUNINGS = 3
-RIVALS = 3      # hypotheses of different classes that are estimated jointly
+RIVALS = 2      # hypotheses of different classes that are estimated jointly
 WORSE = 1.02
 
 
@@ -194,7 +194,7 @@ def _best(campaign: Campaign, linear: Linear, drive: Drive, singles: Sequence[We
 
 def _misfit(campaign: Campaign, waves: Sequence[Array]) -> float:
     """Mean over fitted records of squared error over squared response; infinite if a simulation failed."""
-    trials = campaign.used("fit")
+    trials = simulated(campaign)
     if len(waves) != len(trials) or not all(np.isfinite(w).all() for w in waves):
         return float("inf")
     return float(np.mean([((t.recording.response[:len(w)] - w) ** 2).sum() / (t.recording.response[:len(w)] ** 2).sum()
@@ -207,7 +207,7 @@ def _shown(linear: Linear, drive: Drive, ext: Extended, trial: Trial) -> Shown:
 
 def _bands(campaign: Campaign, waves: list[Array]) -> Bands:
     """Width of predictive bands from the fitted records."""
-    trials = campaign.used("fit")
+    trials = simulated(campaign)
     noise = trials[0].noise
     if len(waves) != len(trials):
         size = np.std(trials[0].recording.response, axis=0)
@@ -237,7 +237,8 @@ def score_all(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]], 
             value, error = elpd_difference(z, a, b, bands[0], bands[1], t.recording.fs)
             sums["elpd"].append(value)
             sums["variance"].append(error ** 2)
-    out = {name: float(np.sqrt(np.mean(sums[name]))) if sums[name] else float("nan") for name in ("nominal", "updated", "extended", "noise")}
+    out = {name: float(np.sqrt(np.mean(sums[name]))) if sums[name] else float("nan")
+           for name in ("nominal", "updated", "extended", "noise")}
     out["coverage90"] = float(np.mean(sums["coverage"])) if sums["coverage"] else float("nan")
     out["elpd"], out["elpd_se"] = float(np.sum(sums["elpd"])), float(np.sqrt(np.sum(sums["variance"])))
     return out

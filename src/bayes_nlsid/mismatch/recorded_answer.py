@@ -68,7 +68,8 @@ def claims(effects: Key) -> str:
 
 def _named(found: Evidence, seed: int) -> tuple[Named, ...]:
     ordered = sorted(found.odds.items(), key=lambda kv: -kv[1])
-    out, rest = [], 0.0
+    out: list[Named] = []
+    rest = 0.0
     for key, p in ordered:
         if len(out) >= LISTED and key not in ((), OTHER):
             rest += p
@@ -128,7 +129,8 @@ def _where(found: Evidence) -> dict[str, Any]:
     ranked = sorted(table.items(), key=lambda kv: -kv[1])[:8]
     best = leading(found)
     alike = _alike(found, best) if best is not None else {}
-    locations = [{"name": n, "probability": min(p, 1.0), "indistinguishable_from": [m for m in alike.get(n, []) if m != n]} for n, p in ranked]
+    locations = [{"name": n, "probability": min(p, 1.0), "indistinguishable_from": [m for m in alike.get(n, []) if m != n]}
+                 for n, p in ranked]
     onset, unit, phase = 0.0, "m", "-"
     if best is not None:
         suspect = best.suspects[0]
@@ -227,14 +229,14 @@ def retuned(found: Evidence) -> list[str]:
     before, after, tolerance = start_of(found.campaign, nominal=True), found.tuned, found.campaign.tolerances
     if after.status.startswith("not") or "failed" in after.status:
         return [f"The linear model could not be re-tuned by simulation: {after.status}."]
-    omega, zeta = after.model.linear_values(after.theta)
-    for i, (w, z) in enumerate(zip(omega, zeta, strict=True)):
+    omega, _ = after.model.linear_values(after.theta)
+    for i, w in enumerate(omega):
         if w >= RIGID:
             old = float(before.modal.omega[i])
             change = w / old - 1
             if abs(change) > 3 * tolerance.get("frequency", 0.05):
-                out.append(f"Mode {i + 1} was re-tuned from {old / 2 / np.pi:.4g} to {w / 2 / np.pi:.4g} Hz, beyond its tolerance: stiffness or "
-                           "mass of the nominal model are off, which of them these records cannot say.")
+                out.append(f"Mode {i + 1} was re-tuned from {old / 2 / np.pi:.4g} to {w / 2 / np.pi:.4g} Hz, beyond its tolerance: "
+                           "stiffness or mass of the nominal model is off; these records cannot say which.")
     gain = after.model.gain(after.theta)
     if gain is not None and abs(float(gain) - 1) > 3 * tolerance.get("gain", 0.05):
         out.append(f"The measured force had to be multiplied by {float(gain):.3g}: the force cell, or the mass of the model, is off.")
@@ -258,18 +260,20 @@ def _percent(value: float) -> str:
 
 def _sentence(found: Evidence, verdict: str, p: float, hypotheses: tuple[Named, ...], where: dict[str, Any]) -> str:
     s = found.scores
-    end = (f"On {len(found.shown)} record{'s' if len(found.shown) != 1 else ''} that {'were' if len(found.shown) != 1 else 'was'} not used the "
-           f"error is {_percent(s['nominal'])} as delivered and {_percent(s['updated'])} with the best linear re-tuning")
+    many = len(found.shown) != 1
+    end = (f"On {len(found.shown)} record{'s' if many else ''} that {'were' if many else 'was'} not used the error "
+           f"is {_percent(s['nominal'])} as delivered and {_percent(s['updated'])} with the best linear re-tuning")
     if verdict == "none":
         return f"Beyond what a re-tuned linear model explains nothing was found (probability {100 * (1 - p):.0f} %). {end}; sensor noise " \
                f"alone makes {_percent(s['noise'])}."
     top = next(h for h in hypotheses if h.effects != (("none", "-"),))
     place = next((q for _, q in top.effects if q != "-"), "-")
-    alike = next((x["indistinguishable_from"] for x in where["locations"] if x["name"] == place), [])
+    alike: list[str] = next((x["indistinguishable_from"] for x in where["locations"] if x["name"] == place), [])
     places = place + (f" (not to be told from {', '.join(alike)})" if alike else "")
     words = top.sentence.replace(place, places, 1) if place != "-" else top.sentence
     share = _class_probability(found.odds, top.effects)
-    rival = next((h for h in hypotheses if h.effects != (("none", "-"),) and {c for c, _ in h.effects} != {c for c, _ in top.effects}), None)
+    own = {c for c, _ in top.effects}
+    rival = next((h for h in hypotheses if h.effects != (("none", "-"),) and {c for c, _ in h.effects} != own), None)
     follow = f"; next, {rival.sentence} ({100 * _class_probability(found.odds, rival.effects):.0f} %)" if rival is not None else ""
     proof = f", and {_percent(s['extended'])} with what was found" if found.named is not None else ""
     lead = "The recordings differ from any linear model" if verdict == "mismatch" else "It cannot be told for sure what is missing"

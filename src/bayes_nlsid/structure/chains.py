@@ -47,7 +47,7 @@ def oscillator(*, mass: float = 1.0, stiffness: float | None = None, frequency: 
         raise ValueError("oscillator: a mass without stiffness has no damping ratio; give damping (N s/m)")
     omega = max(np.sqrt(stiffness / mass), FREE) if stiffness is not None else 2 * np.pi * float(frequency or 0.0)
     ratio = zeta if zeta is not None else (damping or 0.0) / (2 * mass * omega)
-    if not 0 <= ratio < 1:
+    if not 0 <= ratio or (ratio >= 1 and stiffness != 0):
         raise ValueError(f"oscillator: damping must not be negative and below critical, got ratio {ratio:g}")
     places = tuple(dict.fromkeys((location, *sensors, *inputs)))
     return ModalModel(np.array([omega]), np.array([ratio]), places, np.full((len(places), 1), mass**-0.5),

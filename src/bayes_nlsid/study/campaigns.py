@@ -17,6 +17,7 @@ from bayes_nlsid.mismatch.campaign import (
     energetic_band,
     in_band,
     make_trial,
+    parted,
 )
 from bayes_nlsid.mismatch.case import CLASSES
 from bayes_nlsid.recordings.checks import check
@@ -49,7 +50,8 @@ def campaign_of(study: Study) -> Campaign:
     if not fitted:
         raise InputError(f"{study.file.name}: [[recordings]]", 'none that can be read has role = "train"', "mark one to be fitted")
     if not judged:
-        fitted, judged = _split(fitted)
+        fitted, judged, quiet = _split(fitted)
+        recordings += quiet
         notes.append(f"No record is marked for judging (role = \"holdout\"): the last {100 * (1 - SPLIT):.0f} % of every record was kept "
                      "for that and not fitted.")
     top = _top(study, start, fitted)
@@ -85,7 +87,8 @@ def _read(spec: RecordingSpec, notes: list[str]) -> Recording | None:
         try:
             return read_recording(left)
         except InputError as error:
-            broken = [c for c in left.channels if c.name and repr(c.name) in f"{error.where} {error.problem}" or f"{c.array}" == error.where]
+            said = f"{error.where} {error.problem}"
+            broken = [c for c in left.channels if c.name and repr(c.name) in said or f"{c.array}" == error.where]
             usable = [c for c in left.channels if c not in broken and c.quantity != "force"]
             if not broken or not usable or any(c.quantity == "force" for c in broken):
                 if spec.role == "train" and not broken:
@@ -109,9 +112,9 @@ def _calibrated(study: Study, nominal: ModalModel, recordings: list[Recording], 
     return model_from(arrays, data["model"])
 
 
-def _split(fitted: list[Recording]) -> tuple[list[Recording], list[Recording]]:
-    """The first part of every record to fit, the rest to judge; periodic records are cut at whole periods, or kept whole."""
-    first, second = [], []
+def _split(fitted: list[Recording]) -> tuple[list[Recording], list[Recording], list[Recording]]:
+    """The first part of every record to fit, the rest to judge, quiet ends; periodic records are cut at whole periods, or kept whole."""
+    first, second, quiet = [], [], []
     for r in fitted:
         whole = r.n * r.dt
         if r.period is not None:
@@ -125,10 +128,15 @@ def _split(fitted: list[Recording]) -> tuple[list[Recording], list[Recording]]:
             cut = max(1, round(SPLIT * periods)) * r.period * r.dt
             cut = min(cut, (periods - 1) * r.period * r.dt)
         else:
-            cut = SPLIT * whole
+            head, tail, rest = parted(r, SPLIT)
+            first.append(head)
+            second.append(replace(tail, name=f"{r.name} (rest)", role="holdout"))
+            if rest is not None and rest.n >= 64:
+                quiet.append(replace(rest, name=f"{r.name} (quiet end)", role="noise"))
+            continue
         first.append(r.window(0.0, cut))
         second.append(replace(r.window(cut, whole), name=f"{r.name} (rest)", role="holdout"))
-    return first or fitted, second
+    return first or fitted, second, quiet
 
 
 def _top(study: Study, model: ModalModel, fitted: list[Recording]) -> float:
@@ -146,7 +154,7 @@ def _trials(fitted: list[Recording], judged: list[Recording], noises: dict[str, 
 
     out = []
     most = max(4000, MOST // (len(fitted) * max(len(r.channels) for r in fitted)))
-    uses: list[tuple[Recording, Use]] = [*((r, "fit") for r in fitted), *((r, "judge") for r in judged)]  # type: ignore[list-item]
+    uses: list[tuple[Recording, Use]] = [*((r, "fit") for r in fitted), *((r, "judge") for r in judged)]
     for recording, use in uses:
         reference = next((n for n in noises.values() if n.channels == recording.channels and abs(n.dt / recording.dt - 1) < 1e-9), None)
         try:

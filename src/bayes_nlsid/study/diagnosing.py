@@ -19,8 +19,8 @@ from bayes_nlsid.study.progress import Reporter, duration
 from bayes_nlsid.study.store import versions, write_atomic, writing
 
 
-def run_diagnosis(path: Path | str, out: Path | str, *, seed: int = 0, reporter: Reporter | None = None) -> Diagnosis:
-    """Diagnose a case folder and leave ``diagnosis.json``, ``predictions.npz``, ``report.html`` and ``figures/`` in ``out``.
+def run_diagnosis(path: Path | str, out: Path | str, *, seed: int | None = None, reporter: Reporter | None = None) -> Diagnosis:
+    """Diagnose a study or a case folder and leave ``diagnosis.json``, ``predictions.npz``, ``report.html`` and ``figures/`` in ``out``.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def run_diagnosis(path: Path | str, out: Path | str, *, seed: int = 0, reporter:
         return _carry_out(case, folder, seed, reporter)
 
 
-def _carry_out(case: Path, folder: Path, seed: int, reporter: Reporter | None) -> Diagnosis:
+def _carry_out(case: Path, folder: Path, seed: int | None, reporter: Reporter | None) -> Diagnosis:
     """Diagnose and write, with the folder held."""
     told = reporter if reporter is not None else Reporter((folder / "run.log",))
     told.begin(1, 2, "diagnose", str(case))
