@@ -201,7 +201,9 @@ def onset_of(suspect: Suspect, p: Array) -> float:
     if name == "clearance":
         return float(p[1]) / 2
     if name == "one_sided_spring":
-        return abs(float(p[1]))
+        return abs(float(p[1])) * float(p[2])
+    if name in ("rounded_gap", "one_stop", "two_stops"):
+        return float(p[1])
     if name == "saturating_spring":
         return 0.1 * float(p[1])
     if name in ("iwan4_memory", "jenkins_memory"):

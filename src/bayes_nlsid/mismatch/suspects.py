@@ -13,13 +13,19 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import Motion, force_along
-from bayes_nlsid.mismatch.catalogue import BOUC_WEN, ROWS, Law, Size
+from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.innovations import Bench, Desk
+from bayes_nlsid.mismatch.laws import Law, Size
 from bayes_nlsid.mismatch.observer import ORDER
 
 Array = NDArray[np.float64]
 FINER = 4   # force laws are evaluated so many times finer than the records: what they make above the analysed band must not fold back
+# Loops whose branches stiffen or soften. With nu = 1 the force scales with alpha alone; beta and gamma act as a product.
+BOUC_WEN = Law(LIBRARY["bouc_wen"], lambda z: np.array([[1.0, b / z.displacement, 1.0, d, 1.0] for b in (0.3, 1.0, 3.0)
+                                                        for d in (-1.6, -1.2, -0.5, 0.5)]),
+               ("log", "log", "fixed", "linear", "fixed"), (0,), excess=True)
 FORCES = ("hardening", "softening", "clearance", "asymmetric", "coulomb", "quad_damping", "hysteresis")
 
 
@@ -122,8 +128,9 @@ def response(bench: Bench, place: Place, law: Law, shapes: Array) -> Array:
 
 
 def laws_of(cls: str) -> tuple[Law, ...]:
-    """Force laws of a class, those that need a march through the motion included."""
-    return (*ROWS[cls].laws, BOUC_WEN) if cls == "hysteresis" else ROWS[cls].laws
+    """Force laws of a class that both the regression and the simulation can carry."""
+    laws = tuple(law for law in ROWS[cls].laws if law.convert is None)
+    return (*laws, BOUC_WEN) if cls == "hysteresis" else laws
 
 
 def force_suspects(bench: Bench, places: Sequence[Place], classes: Sequence[str],
