@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from bayes_nlsid.forces import laws
 from bayes_nlsid.forces.parameter import Param
 from bayes_nlsid.forces.term import Term
+from bayes_nlsid.mismatch.calibrated import Drive, Linear, observer_of
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.innovations import Drive, Linear, observer_of
 from bayes_nlsid.mismatch.observer import observe
 from bayes_nlsid.mismatch.prove import envelope
 from bayes_nlsid.mismatch.suspects import Suspect

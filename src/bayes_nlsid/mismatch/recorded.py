@@ -14,9 +14,10 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
 from bayes_nlsid.mismatch.forward import Extended, estimate, extended, predict, simulated
-from bayes_nlsid.mismatch.innovations import Bench, Drive, Linear, lay_out
+from bayes_nlsid.mismatch.innovations import Bench, lay_out
 from bayes_nlsid.mismatch.observer import Modal
 from bayes_nlsid.mismatch.odds import Key, odds_of
 from bayes_nlsid.mismatch.prove import Bands, calibrate_bands, elpd_difference
