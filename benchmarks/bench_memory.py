@@ -2,7 +2,7 @@
 
     python benchmarks/bench_memory.py
 
-Ten modes, five joints (the stand-in of ``bench_simulation.py``). Every row is a process of its own, and what it needs is what the operating
+Ten modes, five joints (the stand-in of ``case.py``). Every row is a process of its own, and what it needs is what the operating
 system counted for it at the end, the interpreter and all libraries included.
 """
 
@@ -20,7 +20,7 @@ SAMPLES, FLOOR, START = 1000, 1e-5, 4e-3
 
 
 def _draws(count: int, width: int) -> np.ndarray:
-    from benchmarks.bench_simulation import JOINT
+    from benchmarks.case import JOINT
 
     centre = np.tile(np.append(JOINT, [1.0])[:width], 5)
     return centre * (1 + 0.05 * np.random.default_rng(2).standard_normal((count, 5 * width)))
@@ -35,7 +35,7 @@ def averaging(term: str) -> None:
     """Backbone band by averaging."""
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.fast import fast_bands
-    from benchmarks.bench_simulation import beam
+    from benchmarks.case import beam
 
     found = fast_bands(_draws(SAMPLES, 4), beam(LIBRARY[term]), at="tip", start_amplitude=START, stop_amplitude=FLOOR)
     assert found.status == {"ok": SAMPLES}, found.status
@@ -45,7 +45,7 @@ def integrated(term: str, width: int = 4) -> None:
     """Backbone band by time integration of every sample, HHT at 8192 Hz, from 4 mm down to 10 µm."""
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.bands import backbone_bands
-    from benchmarks.bench_simulation import FS, beam
+    from benchmarks.case import FS, beam
 
     found = backbone_bands(_draws(SAMPLES, width), beam(LIBRARY[term]), at="tip", start_amplitude=START, stop_amplitude=FLOOR, fs=FS)
     assert found.status == {"ok": SAMPLES}, found.status
@@ -57,7 +57,7 @@ def swept(term: str) -> None:
 
     from bayes_nlsid.forces.library import LIBRARY
     from bayes_nlsid.prediction.response_bands import response_bands
-    from benchmarks.bench_simulation import beam
+    from benchmarks.case import beam
 
     model = beam(LIBRARY[term])
     model = replace(model, linear=replace(model.linear, inputs=("tip",)))
@@ -72,7 +72,7 @@ def scattered() -> None:
     from bayes_nlsid.prediction.montecarlo import Decay, backbones
     from bayes_nlsid.prediction.sampling_plan import scattered_plan
     from bayes_nlsid.prediction.sensitivity import sobol
-    from benchmarks.bench_simulation import JOINT, beam
+    from benchmarks.case import JOINT, beam
 
     model, centre = beam(LIBRARY["iwan4"]), np.tile(JOINT, 5)
     spreads = [(i, Prior(name, parameter.unit, "normal", float(min(0.6 * c, 1.4 * c)), float(max(0.6 * c, 1.4 * c)), float(c),
