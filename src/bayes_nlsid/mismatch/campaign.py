@@ -108,24 +108,27 @@ class Campaign:
         return tuple(t for t in self.trials if t.use == use)
 
 
-def decimated(recording: Recording, top: float) -> Recording:
+def decimated(recording: Recording, top: float, bottom: float = 0.0) -> Recording:
     """The recording low-passed at ``top`` (Hz) and sampled as coarsely as that allows; unchanged if it is sampled coarsely already.
 
-    The filter has no phase; a transient is continued beyond its ends before it is filtered.
+    ``bottom`` (Hz) above zero takes slow motion off too. The filter has no phase; a transient is continued beyond its ends first.
     """
     step = int(np.floor(PASS * recording.fs / top + 1e-9))
     periodic = recording.period is not None
     while periodic and step > 1 and (recording.period or 1) % step:
         step -= 1
-    if step <= 1:
+    if step <= 1 and bottom <= 0:
         return recording
-    stop = 0.48 * recording.fs / step
+    stop = 0.48 * recording.fs / max(step, 1)
     signals = np.concatenate([recording.response, recording.force], axis=1)
     n = len(signals)
-    far = 0 if periodic else min(n - 1, int(16 * recording.fs / top))
+    far = 0 if periodic else min(n - 1, int(16 * recording.fs / (min(top, 4 * bottom) if bottom > 0 else top)))
     padded = _continued(signals, far) if far else signals
     f = np.asarray(np.fft.rfftfreq(len(padded), recording.dt), dtype=np.float64)
     gain = 1 - smooth_step(f, min(top, 0.99 * stop), stop)
+    if bottom > 0:
+        gain = gain * smooth_step(f, 0.5 * bottom, bottom)
+    step = max(step, 1)
     low = np.fft.irfft(np.fft.rfft(padded, axis=0) * gain[:, None], n=len(padded), axis=0)[far:far + n][::step]
     low = low[:n // step] if periodic else low
     s = recording.response.shape[1]
@@ -185,20 +188,37 @@ def energetic_band(model: ModalModel, recordings: Sequence[Recording], share: fl
     return float(min(edge, PASS * clock))
 
 
+def lower_edge(model: ModalModel, recordings: Sequence[Recording], stated: float = 0.0) -> float:
+    """Hz below which the records are not analysed: 0, or what keeps motion out that the model does not have.
+
+    That is the stated edge where it lies close below the first elastic mode, and four tenths of that mode for accelerations of a free
+    decay (a suspension swings under most of them), unless the model has rigid bodies.
+    """
+    elastic = model.frequency[model.omega > RIGID]
+    if not elastic.size or elastic.size < model.modes:
+        return 0.0
+    first = float(elastic[0])
+    edge = stated if 0.3 * first <= stated < first else 0.0
+    if all(r.free and {c.quantity for c in r.channels} == {"acceleration"} for r in recordings):
+        edge = max(edge, 0.4 * first)
+    return float(edge)
+
+
 def in_band(model: ModalModel, top: float, most: int = 16) -> ModalModel:
     """The model with the modes below ``top`` only (at least one)."""
     inside = np.flatnonzero(model.frequency <= top)
     return model.take(inside[:most] if inside.size else [0])
 
 
-def make_trial(recording: Recording, use: Use, top: float, floor: NoiseFloor | None, most: int) -> Trial:
-    """Low-pass, decimate and, where a record is very long, cut to ``most`` samples (of those to be fitted)."""
-    small = decimated(recording, top)
+def make_trial(recording: Recording, use: Use, top: float, floor: NoiseFloor | None, most: int,
+               bottom: float = 0.0) -> Trial:
+    """Filter, decimate and, where a record is very long, cut to ``most`` samples (of those to be fitted)."""
+    small = decimated(recording, top, bottom)
     if use == "fit" and small.n > most:
         period = small.period
         keep = max(period, most // period * period) if period else most
         small = small.window(0.0, keep * small.dt)
-    noise = np.zeros(len(recording.channels)) if floor is None else floor.rms((0.0, min(top, float(floor.frequency[-1]))))
+    noise = np.zeros(len(recording.channels)) if floor is None else floor.rms((bottom, min(top, float(floor.frequency[-1]))))
     if floor is not None and floor.sure == "bound":
         noise = np.minimum(noise, _above_the_band(recording, top))
     loud = small.force if small.force.shape[1] and np.abs(small.force).any() else small.response

@@ -15,7 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.mismatch.campaign import MOST, PASS, Campaign, Trial, Use, campaign_notes, energetic_band, in_band, make_trial, parted
+from bayes_nlsid.mismatch.campaign import (
+    MOST,
+    PASS,
+    Campaign,
+    Trial,
+    Use,
+    campaign_notes,
+    energetic_band,
+    in_band,
+    lower_edge,
+    make_trial,
+    parted,
+)
 from bayes_nlsid.mismatch.case import CLASSES, TOLERANCES, _json, _kind, _load, _under
 from bayes_nlsid.recordings.checks import check
 from bayes_nlsid.recordings.noise import noise_psd
@@ -111,7 +123,8 @@ def campaign_from_case(path: str | Path) -> Campaign:
         top = energetic_band(model, fit)
         notes.append(f"No band is stated: records were analysed up to {top:.3g} Hz, where the motion is.")
     noises = {r.name: r for r, use in records if use == "noise"}
-    trials = _trials(records, noises, top, notes)
+    bottom = lower_edge(model, fit, float(band[0]) if isinstance(band, list) and len(band) == 2 else 0.0)
+    trials = _trials(records, noises, (bottom, top), notes)
     model = in_band(model, top)
     places = _places(model, meta)
     tolerances = TOLERANCES | {k: float(v) for k, v in _under(meta, "tolerances").items() if k in TOLERANCES}
@@ -271,7 +284,7 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
     return out
 
 
-def _trials(records: list[tuple[Recording, Use]], noises: dict[str, Recording], top: float, notes: list[str]) -> tuple[Trial, ...]:
+def _trials(records: list[tuple[Recording, Use]], noises: dict[str, Recording], band: tuple[float, float], notes: list[str]) -> tuple[Trial, ...]:
     fitted = [r for r, use in records if use == "fit"]
     most = max(4000, MOST // (len(fitted) * max(len(r.channels) for r in fitted)))
     out = []
@@ -280,7 +293,8 @@ def _trials(records: list[tuple[Recording, Use]], noises: dict[str, Recording], 
             continue
         reference = next((n for n in noises.values() if n.channels == recording.channels and abs(n.dt / recording.dt - 1) < 1e-6), None)
         try:
-            out.append(make_trial(recording, use, top, None if use == "sealed" else noise_psd(recording, reference), most))
+            floor = None if use == "sealed" else noise_psd(recording, reference)
+            out.append(make_trial(recording, use, band[1], floor, most, 0.0 if use == "sealed" else band[0]))
         except ValueError as error:
             notes.append(f"Record {recording.name} was left out: {error}.")
     return tuple(out)

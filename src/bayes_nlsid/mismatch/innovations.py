@@ -174,7 +174,7 @@ def lay_out(campaign: Campaign, linear: Linear, known: Sequence[Array] | None = 
     for entry, desk in zip(raw, plain, strict=True):
         s = entry[1].innovations.shape[1]
         count = (desk.n - desk.skip) * s
-        filters, root = _whitener(left[at:at + count].reshape(-1, s), entry[6])
+        filters, root = _whitener(left[at:at + count].reshape(-1, s), entry[6], 0 if entry[0].recording.free else PREWHITEN)
         at += count
         desks.append(_desk(*entry, filters, root, campaign.top))
     return _assemble(linear, _evened(linear, desks, taps, drive), taps, drive)
@@ -217,13 +217,16 @@ def _filtered(e: Array, filters: Complex | Array, root: Array, N: int) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(e, n=N, axis=0) * filters, n=N, axis=0)[:len(e)] @ root.T)
 
 
-def _whitener(left: Array, N: int) -> tuple[Complex, Array]:
-    """Autoregressive filter of each channel at the lines of a transform of length N, and the root of the inverse covariance after it."""
+def _whitener(left: Array, N: int, most: int) -> tuple[Complex, Array]:
+    """Autoregressive filter of each channel at the lines of a transform of length N, and the root of the inverse covariance after it.
+
+    ``most`` is its order at most: 0 for free decays, in which all that is left lies about one line and a filter would notch it out.
+    """
     from scipy.linalg import solve_toeplitz
     from scipy.signal import lfilter
 
     n, s = left.shape
-    order = min(PREWHITEN, n // 20)
+    order = min(most, n // 20)
     filters = np.ones((N // 2 + 1, s), dtype=complex)
     white = np.empty_like(left)
     for c in range(s):

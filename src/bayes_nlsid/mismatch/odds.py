@@ -8,7 +8,7 @@ does not. The numbers were set on simulated oscillators and chains (`tests/misma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -88,7 +88,7 @@ def two(singles: Sequence[Weighed], pairs: Sequence[Weighed], layer: OddsLayer =
 
 
 def odds_of(singles: Sequence[Weighed], pairs: Sequence[Weighed], values: float, unexplained: float = 0.0,
-            layer: OddsLayer = LAYER) -> dict[Key, float]:
+            proof: float = 0.0, tilt: Mapping[Key, float] | None = None, layer: OddsLayer = LAYER) -> dict[Key, float]:
     """Probability of every hypothesis, of none (empty key) and of something outside the catalogue; they sum to one.
 
     Parameters
@@ -98,14 +98,18 @@ def odds_of(singles: Sequence[Weighed], pairs: Sequence[Weighed], values: float,
         Independent values on the bench.
     unexplained : float
         Share of the error energy of the best linear model, noise apart, that the best hypothesis leaves on records not fitted.
+    proof : float
+        Probability that something is missing from what simulation of whole records shows.
+    tilt : mapping or None
+        Factors on the odds of hypotheses that were simulated.
     """
     leaders = [w for group in (pairs[:1], singles[:1]) for w in group]
     best = max(leaders, key=lambda w: w.gain) if leaders else None
-    missing = something(best, values, layer)
+    missing = 1 - (1 - something(best, values, layer)) * (1 - min(proof, 0.9995))
     double = two(singles, pairs, layer)
     weights: dict[Key, float] = {}
     for group, share in ((singles, 1 - double), (pairs, double)):
-        raw = _raw(group, layer)
+        raw = {key: value * (tilt or {}).get(key, 1.0) for key, value in _raw(group, layer).items()}
         total = sum(raw.values())
         for key, value in raw.items():
             weights[key] = weights.get(key, 0.0) + share * value / total

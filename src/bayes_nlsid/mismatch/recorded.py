@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.forward import Extended, estimate, extended, predict, simulated
+from bayes_nlsid.mismatch.contest import Entrant, enter, errors_by_block, hold, proof, tilts, unexplained_error
+from bayes_nlsid.mismatch.forward import Extended, extended, predict, simulated
 from bayes_nlsid.mismatch.innovations import Bench, lay_out
 from bayes_nlsid.mismatch.observer import Modal
-from bayes_nlsid.mismatch.odds import Key, odds_of
+from bayes_nlsid.mismatch.odds import OTHER, Key, odds_of
 from bayes_nlsid.mismatch.prove import Bands, calibrate_bands, elpd_difference
 from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.mismatch.weigh import Scale, Weighed, doubles, scale_of, weigh
@@ -27,7 +28,6 @@ from bayes_nlsid.mismatch.weigh import Scale, Weighed, doubles, scale_of, weigh
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 RETUNINGS = 3
-RIVALS = 2      # hypotheses of different classes that are estimated jointly
 WORSE = 1.02
 
 
@@ -134,21 +134,26 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     odds = odds_of(singles, pairs, values)
     say(0.5, "re-tuning the linear model by forward simulation")
     channels = len(campaign.used("fit")[0].recording.channels)
-    tuned, tuned_fit = estimate(linear, drive, campaign, extended(linear, (), (), channels))
+    linear_one = enter(campaign, linear, drive, None)
+    rivals = hold(campaign, linear, drive, linear_one, singles, pairs, odds, say)
+    tilt = tilts(rivals)
+    leader = _leader(linear_one, rivals, odds, tilt)
+    tuned, best, named = linear_one.model, leader.model, leader.weighed
     nominal = extended(start_of(campaign, nominal=True), (), (), channels, freed=False)
-    best, best_fit, named = _best(campaign, linear, drive, singles, pairs, odds, channels, tuned, tuned_fit, say)
     say(0.85, "simulating records that were not used")
     shown = {t.name: (_shown(start_of(campaign, nominal=True), drive, nominal, t), _shown(linear, drive, tuned, t),
                       _shown(linear, drive, best, t)) for t in campaign.used("judge")}
-    bands = (_bands(campaign, tuned_fit), _bands(campaign, best_fit))
+    bands = (_bands(campaign, linear_one.waves), _bands(campaign, leader.waves))
     scores = score_all(campaign, shown, bands)
+    sure = _proved(campaign, shown) if named is not None else 0.0
     withdrawn = named is not None and scores.get("extended", np.inf) > WORSE * scores.get("updated", np.inf)
     if withdrawn:
         notes += ("The named effect made the records that were not used worse and was withdrawn from the predictions.",)
-        best, named, shown = tuned, None, {n: (s[0], s[1], s[1]) for n, s in shown.items()}
+        best, named, shown, sure = tuned, None, {n: (s[0], s[1], s[1]) for n, s in shown.items()}, 0.0
         bands = (bands[0], bands[0])
         scores = score_all(campaign, shown, bands)
-    odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0)
+    odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0, sure, tilt)
+    odds = _outside(odds, scores)
     if withdrawn:
         odds = {k: (v * 0.5 if k else 0.5 + 0.5 * v) for k, v in odds.items()}
     return Evidence(campaign, linear, drive, scale, tuple(singles), tuple(pairs), odds, tuned, best, named, shown, scores, bands, withdrawn,
@@ -157,8 +162,10 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
 
 def _one_linear_reading(campaign: Campaign, singles: list[Weighed], pairs: list[Weighed]
                         ) -> tuple[list[Weighed], list[Weighed], tuple[str, ...]]:
-    """A single record cannot tell a drift from an effect that follows the decay: it is kept as a rival only with several records."""
-    if len(campaign.used("fit")) > 1:
+    """A single record, or free decays each quieter than the one before, cannot tell a drift from an effect that follows the amplitude: a
+    drift is kept as a rival only where they can."""
+    fit = sorted(campaign.used("fit"), key=lambda t: t.recording.start)
+    if len(fit) > 1 and not (all(t.recording.free for t in fit) and bool(np.all(np.diff([t.level for t in fit]) < 0))):
         return singles, pairs, ()
 
     def fine(w: Weighed) -> bool:
@@ -167,46 +174,36 @@ def _one_linear_reading(campaign: Campaign, singles: list[Weighed], pairs: list[
     return [w for w in singles if fine(w)], [w for w in pairs if fine(w)], ()
 
 
-def modelled(w: Weighed) -> bool:
-    """Whether every effect of a hypothesis is a force law that the simulation can carry."""
-    terms = [(s.law.term.name, s.place) for s in w.suspects if s.law is not None]
-    return len(terms) == len(w.suspects) and len(set(terms)) == len(terms)
+def _leader(tuned: Entrant, rivals: Sequence[Entrant], odds: dict[Key, float], tilt: dict[Key, float]) -> Entrant:
+    """The likeliest rival that simulates the fitted records better than the linear model does; the linear model if there is none."""
+    level = float(tuned.blocks.mean()) if not tuned.failed else np.inf
+    able = [(odds.get(r.weighed.key, 0.0) * tilt.get(r.weighed.key, 1.0), i) for i, r in enumerate(rivals)
+            if r.weighed is not None and not r.failed and float(r.blocks.mean()) < level]
+    return rivals[max(able)[1]] if able else tuned
 
 
-def _best(campaign: Campaign, linear: Linear, drive: Drive, singles: Sequence[Weighed], pairs: Sequence[Weighed], odds: dict[Key, float],
-          channels: int, tuned: Extended, tuned_fit: list[Array], say: Progress) -> tuple[Extended, list[Array], Weighed | None]:
-    """The likeliest hypotheses estimated jointly; the one that simulates the fitted records best among those that are likely."""
-    ranked = sorted((w for w in (*singles, *pairs) if modelled(w) and odds.get(w.key, 0.0) > 0.02 and w.gain > 0),
-                    key=lambda w: -odds[w.key])
-    chosen: list[Weighed] = []
-    for w in ranked:
-        if all({c for c, _ in w.key} != {c for c, _ in other.key} for other in chosen):
-            chosen.append(w)
-    best, fit, named, cost = tuned, tuned_fit, None, _misfit(campaign, tuned_fit)
-    for i, w in enumerate(chosen[:RIVALS]):
-        say(0.55 + 0.1 * i, "estimating " + " and ".join(f"{c} at {p}" for c, p in w.key))
-        ext, waves = estimate(linear, drive, campaign, extended(linear, w.suspects, w.factors, channels))
-        found = _misfit(campaign, waves)
-        # the likeliest keeps its place unless a rival simulates clearly better
-        if found < (cost if named is None else 0.9 * cost):
-            best, fit, named, cost = ext, waves, w, found
-    return best, fit, named
+def _proved(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> float:
+    """What records that were not fitted say for the extended model against the re-tuned one."""
+    trials = campaign.used("judge")
+    if not trials:
+        return 0.0
+    first = [max(s.first for s in shown[t.name]) for t in trials]
+    before, after = (errors_by_block(trials, [shown[t.name][i].wave for t in trials], first) for i in (1, 2))
+    return proof(before, after)
 
 
-def _misfit(campaign: Campaign, waves: Sequence[Array]) -> float:
-    """Mean over fitted records of squared error over squared response; infinite if a simulation failed."""
-    trials = simulated(campaign)
-    if len(waves) != len(trials) or not all(np.isfinite(w).all() for w in waves):
-        return float("inf")
-    return float(np.mean([((t.recording.response[:len(w)] - w) ** 2).sum() / (t.recording.response[:len(w)] ** 2).sum()
-                          for t, w in zip(trials, waves, strict=True)]))
+def _outside(odds: dict[Key, float], scores: dict[str, float]) -> dict[Key, float]:
+    """Odds in which what no law explains, though it is large, is counted as outside the catalogue rather than as nothing."""
+    strange = unexplained_error(scores.get("extended", np.nan), scores.get("noise", np.nan))
+    nothing = odds.get((), 0.0)
+    return {**odds, (): nothing * (1 - strange), OTHER: odds.get(OTHER, 0.0) + nothing * strange}
 
 
 def _shown(linear: Linear, drive: Drive, ext: Extended, trial: Trial) -> Shown:
     return Shown(*predict(linear, drive, ext, trial))
 
 
-def _bands(campaign: Campaign, waves: list[Array]) -> Bands:
+def _bands(campaign: Campaign, waves: Sequence[Array]) -> Bands:
     """Width of predictive bands from the fitted records."""
     trials = simulated(campaign)
     noise = trials[0].noise
@@ -214,7 +211,7 @@ def _bands(campaign: Campaign, waves: list[Array]) -> Bands:
         size = np.std(trials[0].recording.response, axis=0)
         return Bands(noise + 1e-9 * size, np.ones(len(noise)), 1.645)
     measured = [t.recording.response[:len(w)] for t, w in zip(trials, waves, strict=True)]
-    found = calibrate_bands(np.maximum(noise, 1e-9 * np.std(measured[0], axis=0)), measured, waves, trials[0].recording.fs)
+    found = calibrate_bands(np.maximum(noise, 1e-9 * np.std(measured[0], axis=0)), measured, list(waves), trials[0].recording.fs)
     return Bands(found.noise, found.relative, float(max(found.factor, 1.645)))
 
 

@@ -16,6 +16,7 @@ from bayes_nlsid.mismatch.campaign import (
     campaign_notes,
     energetic_band,
     in_band,
+    lower_edge,
     make_trial,
     parted,
 )
@@ -55,8 +56,12 @@ def campaign_of(study: Study) -> Campaign:
         notes.append(f"No record is marked for judging (role = \"holdout\"): the last {100 * (1 - SPLIT):.0f} % of every record was kept "
                      "for that and not fitted.")
     top = _top(study, start, fitted)
+    entry = study.identification
+    bottom = lower_edge(start, fitted, 0.0 if entry is None or entry.band is None else entry.band[0])
+    if bottom > 0:
+        notes.append(f"Motion below {bottom:.3g} Hz was taken off the records.")
     noises = {r.name: r for r in recordings if r.role == "noise"}
-    trials = _trials(fitted, judged, noises, top, notes)
+    trials = _trials(fitted, judged, noises, (bottom, top), notes)
     nominal, start = in_band(nominal, top), in_band(start, top)
     places = _places(study, start)
     notes += campaign_notes(trials, bool(noises))
@@ -148,7 +153,7 @@ def _top(study: Study, model: ModalModel, fitted: list[Recording]) -> float:
     return energetic_band(model, fitted)
 
 
-def _trials(fitted: list[Recording], judged: list[Recording], noises: dict[str, Recording], top: float, notes: list[str]
+def _trials(fitted: list[Recording], judged: list[Recording], noises: dict[str, Recording], band: tuple[float, float], notes: list[str]
             ) -> tuple[Trial, ...]:
     from bayes_nlsid.recordings.noise import noise_psd
 
@@ -162,7 +167,7 @@ def _trials(fitted: list[Recording], judged: list[Recording], noises: dict[str, 
         except ValueError as error:
             notes.append(f"Record {recording.name} was left out: {error}.")
             continue
-        trial = make_trial(recording, use, top, floor, most)
+        trial = make_trial(recording, use, band[1], floor, most, band[0])
         if use == "fit" and trial.recording.n * trial.recording.dt < 0.99 * recording.n * recording.dt:
             notes.append(f"Of record {recording.name} the first {trial.recording.n * trial.recording.dt:.3g} s were fitted.")
         out.append(trial)

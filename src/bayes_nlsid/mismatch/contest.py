@@ -1,0 +1,157 @@
+"""Rivals simulated forward: the likeliest hypotheses estimated jointly with the linear model, and what that says for and against each.
+
+Innovations see one step ahead, so an effect that changes a slow decay a little in every cycle hides in them; simulated over a whole
+record it adds up. Errors of the simulated channels are compared block by block in time, in their own standard error, as on the bench.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.campaign import Campaign, Trial
+from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
+from bayes_nlsid.mismatch.innovations import Drive, Linear
+from bayes_nlsid.mismatch.odds import LAYER, Key, OddsLayer, rises
+from bayes_nlsid.mismatch.weigh import Weighed
+
+Array = NDArray[np.float64]
+RIVALS = 3      # hypotheses of different classes that are estimated jointly
+BLOCKS = 24
+LOUD = 3.0      # error of the best linear model over noise from which rivals are simulated whatever the bench says
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Entrant:
+    """A model estimated by simulating the fitted records.
+
+    Parameters
+    ----------
+    weighed : Weighed or None
+        Its hypothesis; None for the linear model.
+    model : Extended
+    waves : tuple of ndarray (n, s)
+        Simulated channels of the fitted records that were simulated; empty if that failed.
+    blocks : ndarray (B,)
+        Logarithm of squared error and noise over squared response, by block of time.
+    """
+
+    weighed: Weighed | None
+    model: Extended
+    waves: tuple[Array, ...]
+    blocks: Array
+
+    @property
+    def failed(self) -> bool:
+        """Whether a record could not be simulated."""
+        return not np.isfinite(self.blocks).all()
+
+
+def errors_by_block(trials: Sequence[Trial], waves: Sequence[Array], first: Sequence[int] | None = None, count: int = BLOCKS) -> Array:
+    """Logarithm of squared error and noise over squared response (B,), blocks shared out among records by their length.
+
+    Both are local, so that loud and quiet stretches count alike. inf where a wave is not finite.
+    """
+    skips = [0] * len(trials) if first is None else list(first)
+    total = sum(len(w) - s for w, s in zip(waves, skips, strict=True))
+    out = []
+    for t, w, s in zip(trials, waves, skips, strict=True):
+        y = t.recording.response[:len(w)]
+        parts = max(2, round(count * (len(w) - s) / max(total, 1)))
+        for at in np.array_split(np.arange(s, len(w)), parts):
+            size = np.mean(y[at] ** 2, axis=0) + t.noise ** 2 + 1e-6 * np.mean(y ** 2, axis=0) + 1e-300
+            wrong = np.mean((y[at] - w[at]) ** 2, axis=0) + t.noise ** 2
+            out.append(float(np.log(np.mean(wrong / size) + 1e-12)) if np.isfinite(wrong).all() else np.inf)
+    return np.array(out)
+
+
+def enter(campaign: Campaign, linear: Linear, drive: Drive, weighed: Weighed | None) -> Entrant:
+    """Estimate one hypothesis (None: the linear model) by simulation."""
+    channels = len(campaign.used("fit")[0].recording.channels)
+    suspects, factors = ((), ()) if weighed is None else (weighed.suspects, weighed.factors)
+    model, waves = estimate(linear, drive, campaign, extended(linear, suspects, factors, channels))
+    trials = simulated(campaign)
+    blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
+    return Entrant(weighed, model, tuple(waves), blocks)
+
+
+def hold(campaign: Campaign, linear: Linear, drive: Drive, tuned: Entrant, singles: Sequence[Weighed], pairs: Sequence[Weighed],
+         odds: dict[Key, float], say: Callable[[float, str], None]) -> list[Entrant]:
+    """Estimate the likeliest hypothesis of each of some classes: those with odds, or all where the linear model leaves much more than noise."""
+    trials = simulated(campaign)
+    floor = np.mean([np.log(np.mean(t.noise ** 2 / (np.mean(t.recording.response ** 2, axis=0) + t.noise ** 2 + 1e-300)) + 1e-12)
+                     for t in trials])
+    loud = tuned.failed or float(np.median(tuned.blocks)) > max(float(floor), np.log(1e-8)) + 2 * np.log(LOUD)
+    ranked = sorted((w for w in (*singles, *pairs) if modelled(w) and w.gain > 0 and (loud or odds.get(w.key, 0.0) > 0.02)),
+                    key=lambda w: -odds.get(w.key, 0.0))
+    chosen: list[Weighed] = []
+    for w in ranked:
+        if all({c for c, _ in w.key} != {c for c, _ in other.key} for other in chosen):
+            chosen.append(w)
+    out = []
+    for i, w in enumerate(chosen[:RIVALS]):
+        say(0.55 + 0.1 * i, "estimating " + " and ".join(f"{c} at {p}" for c, p in w.key))
+        out.append(enter(campaign, linear, drive, w))
+    return out
+
+
+def modelled(w: Weighed) -> bool:
+    """Whether every effect of a hypothesis is a force law that the simulation can carry."""
+    terms = [(s.law.term.name, s.place) for s in w.suspects if s.law is not None]
+    return len(terms) == len(w.suspects) and len(set(terms)) == len(terms)
+
+
+def tilts(entrants: Sequence[Entrant], layer: OddsLayer = LAYER) -> dict[Key, float]:
+    """Factor (at most one) on the odds of every hypothesis that was simulated, by how it compares with the best of them."""
+    able = [e for e in entrants if not e.failed]
+    if not able:
+        return {}
+    best = min(able, key=lambda e: float(e.blocks.mean()))
+    out: dict[Key, float] = {}
+    for e in entrants:
+        assert e.weighed is not None
+        if e.failed:
+            out[e.weighed.key] = (1 + 4.0) ** -layer.power
+            continue
+        difference = e.blocks - best.blocks
+        error = float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
+        # parameters beyond those of the better rival are not charged here: block means differ by far more than they take
+        out[e.weighed.key] = (1 + max(float(difference.mean()), 0.0) / (0.1 + error)) ** -layer.power
+    return out
+
+
+def proof(before: Array, after: Array) -> float:
+    """Probability that something is missing, from records that were not fitted.
+
+    Parameters
+    ----------
+    before, after : ndarray (B,)
+        `errors_by_block` of the best linear and of the extended model.
+
+    Returns
+    -------
+    float
+        Near zero unless the error falls clearly (by a third, as a rule) and in most blocks.
+    """
+    gain = before - after
+    gain = gain[np.isfinite(gain)]
+    if len(gain) < 4 or not np.isfinite(before).all() or not np.isfinite(after).all():
+        return 0.0
+    error = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
+    mean = float(gain.mean())
+    return min(0.999, rises(float(np.exp(mean / 2)), 1.4, 9.0) * rises(mean / (error + 0.05), 2.5, 4.0)) if mean > 0 else 0.0
+
+
+def unexplained_error(error: float, noise: float) -> float:
+    """Probability that something is missing that no law here explains: the best linear model misses records by far more than noise.
+
+    Kept below one half for errors of some per cent, which model error within a band alone can make.
+    """
+    if not (np.isfinite(error) and np.isfinite(noise)) or error <= 0:
+        return 0.0
+    return 0.9 * rises(error, 0.15, 3.0) * rises(error / max(noise, 1e-9), 10.0, 2.0)
