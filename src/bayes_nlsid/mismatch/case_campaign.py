@@ -284,7 +284,8 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
     return out
 
 
-def _trials(records: list[tuple[Recording, Use]], noises: dict[str, Recording], band: tuple[float, float], notes: list[str]) -> tuple[Trial, ...]:
+def _trials(records: list[tuple[Recording, Use]], noises: dict[str, Recording], band: tuple[float, float], notes: list[str]
+            ) -> tuple[Trial, ...]:
     fitted = [r for r, use in records if use == "fit"]
     most = max(4000, MOST // (len(fitted) * max(len(r.channels) for r in fitted)))
     out = []

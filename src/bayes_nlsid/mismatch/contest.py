@@ -80,9 +80,20 @@ def enter(campaign: Campaign, linear: Linear, drive: Drive, weighed: Weighed | N
     return Entrant(weighed, model, tuple(waves), blocks)
 
 
+def polished(campaign: Campaign, linear: Linear, drive: Drive, entrant: Entrant, iterations: int = 24) -> Entrant:
+    """The same entrant estimated to the end, if it stopped at its limit of iterations."""
+    if entrant.failed or entrant.model.status != "iteration limit":
+        return entrant
+    model, waves = estimate(linear, drive, campaign, entrant.model, iterations)
+    trials = simulated(campaign)
+    blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
+    better = np.isfinite(blocks).all() and blocks.mean() < entrant.blocks.mean() + 0.01
+    return Entrant(entrant.weighed, model, tuple(waves), blocks) if better else entrant
+
+
 def hold(campaign: Campaign, linear: Linear, drive: Drive, tuned: Entrant, singles: Sequence[Weighed], pairs: Sequence[Weighed],
          odds: dict[Key, float], say: Callable[[float, str], None]) -> list[Entrant]:
-    """Estimate the likeliest hypothesis of each of some classes: those with odds, or all where the linear model leaves much more than noise."""
+    """Estimate the likeliest hypothesis of some classes: those with odds; all, where the linear model leaves far more than noise."""
     trials = simulated(campaign)
     floor = np.mean([np.log(np.mean(t.noise ** 2 / (np.mean(t.recording.response ** 2, axis=0) + t.noise ** 2 + 1e-300)) + 1e-12)
                      for t in trials])

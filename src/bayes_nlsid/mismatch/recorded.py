@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.contest import Entrant, enter, errors_by_block, hold, proof, tilts, unexplained_error
+from bayes_nlsid.mismatch.contest import Entrant, enter, errors_by_block, hold, polished, proof, tilts, unexplained_error
 from bayes_nlsid.mismatch.forward import Extended, extended, predict, simulated
 from bayes_nlsid.mismatch.innovations import Bench, lay_out
 from bayes_nlsid.mismatch.observer import Modal
@@ -134,10 +134,10 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     odds = odds_of(singles, pairs, values)
     say(0.5, "re-tuning the linear model by forward simulation")
     channels = len(campaign.used("fit")[0].recording.channels)
-    linear_one = enter(campaign, linear, drive, None)
+    linear_one = polished(campaign, linear, drive, enter(campaign, linear, drive, None))
     rivals = hold(campaign, linear, drive, linear_one, singles, pairs, odds, say)
     tilt = tilts(rivals)
-    leader = _leader(linear_one, rivals, odds, tilt)
+    leader = polished(campaign, linear, drive, _leader(linear_one, rivals, odds, tilt))
     tuned, best, named = linear_one.model, leader.model, leader.weighed
     nominal = extended(start_of(campaign, nominal=True), (), (), channels, freed=False)
     say(0.85, "simulating records that were not used")
@@ -152,6 +152,8 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
         best, named, shown, sure = tuned, None, {n: (s[0], s[1], s[1]) for n, s in shown.items()}, 0.0
         bands = (bands[0], bands[0])
         scores = score_all(campaign, shown, bands)
+    notes += tuple(f"Record {n} is simulated worse with what was found than without it, though all together are simulated better."
+                   for n in worse(campaign, shown))
     odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0, sure, tilt)
     odds = _outside(odds, scores)
     if withdrawn:
@@ -190,6 +192,17 @@ def _proved(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) ->
     first = [max(s.first for s in shown[t.name]) for t in trials]
     before, after = (errors_by_block(trials, [shown[t.name][i].wave for t in trials], first) for i in (1, 2))
     return proof(before, after)
+
+
+def worse(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> list[str]:
+    """Names of judged records that the extended model simulates worse than the re-tuned one."""
+    out = []
+    for t in campaign.used("judge"):
+        first = max(s.first for s in shown[t.name])
+        before, after = (float(np.mean((t.recording.response - shown[t.name][i].wave)[first:] ** 2)) for i in (1, 2))
+        if after > WORSE ** 2 * before + float(np.mean(t.noise ** 2)):
+            out.append(t.name)
+    return out
 
 
 def _outside(odds: dict[Key, float], scores: dict[str, float]) -> dict[Key, float]:
