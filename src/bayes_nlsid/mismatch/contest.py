@@ -13,9 +13,9 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import Campaign, Trial
 from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
-from bayes_nlsid.mismatch.innovations import Drive, Linear
 from bayes_nlsid.mismatch.odds import LAYER, Key, OddsLayer, rises
 from bayes_nlsid.mismatch.weigh import Weighed
 
