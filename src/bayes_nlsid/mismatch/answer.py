@@ -207,8 +207,10 @@ def _sentence(verdict: str, p: float, hypotheses: tuple[Named, ...], where: dict
                 f"(noise floor {100 * proof.noise:.2g} %).")
     real = [h for h in hypotheses if h.effects != (("none", "-"),)]
     first = real[0]
-    places = " and ".join(dict.fromkeys(place for _, place in first.effects))
-    text = f"The recordings differ from the model beyond noise (p {sure}). The mismatch sits at {places}"
+    places = " and ".join("a place these data do not show" if q == "-" else q for q in dict.fromkeys(q for _, q in first.effects))
+    text = (f"The recordings differ from the model beyond noise (p {sure})." if p > 0.65 else
+            f"Whether the recordings differ from the model beyond noise and its tolerances cannot be told from these data (p {sure}).")
+    text += f" The mismatch {'sits' if p > 0.65 else 'would sit'} at {places}"
     onset = where["amplitude"]["onset"]
     if onset > 0:
         text += f"; it grows with amplitude from about {onset:.2g} {where['amplitude']['unit']}"

@@ -23,6 +23,7 @@ from bayes_nlsid.mismatch.search import Found, search
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Progress = Callable[[str], None]
+FAINT, FAINT_PLACE = 8.0, 18.0  # gains that the best of all channels, or of all places, has by chance
 TRIED = 10  # rivals that are run on the records kept aside
 
 
@@ -166,7 +167,7 @@ def _disturbed(found: list[Disturbance], rivals: list[Rival], case: Case) -> lis
     best = max(rivals, key=lambda r: r.gain) if rivals else None
     size = {d: _relative(case, d) for d in found}
     for d in found:
-        if d.cls not in known or d.gain <= 0:
+        if d.cls not in known or d.gain < (FAINT_PLACE if d.cls == "other" else FAINT):
             continue
         effect = Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",))
         out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effect,), (size[d],)))

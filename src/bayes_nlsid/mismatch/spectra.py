@@ -137,13 +137,7 @@ def burst_spectra(case: Case, records: tuple[CaseRecord, ...], psd: Array, most:
     usable = case.usable
     stack = np.array([r.accel[:block][:, usable] for r in records])
     force = np.array([r.force[:block] for r in records])
-    noise_rms = np.sqrt(np.interp(np.linspace(0, 1, 64), np.linspace(0, 1, len(psd)), psd.mean(1)).mean())
-    alpha = 0.0
-    tail = max(8, block // 50)
-    end = np.sqrt((stack[:, -tail:] ** 2).mean()) / max(np.sqrt((stack ** 2).mean()), 1e-300)
-    floor = noise_rms / max(np.sqrt((stack ** 2).mean()), 1e-300)
-    if end > max(3e-3, 3 * floor):
-        alpha = np.log(end / max(1e-3, floor)) * case.rate / block
+    alpha = _decay(stack, psd, case)
     window = np.exp(-alpha * np.arange(block) / case.rate)
     full = np.fft.rfft(force * window, axis=1) / block
     low, high = int(np.ceil(case.band[0] * block / case.rate)), int(case.band[1] * block / case.rate)
@@ -153,12 +147,40 @@ def burst_spectra(case: Case, records: tuple[CaseRecord, ...], psd: Array, most:
     grid = np.linspace(0, block // 2, len(psd))
     share = (window ** 2).mean()
     noise = np.stack([np.interp(lines, grid, psd[:, i]) for i in range(psd.shape[1])], axis=1) / block * share
-    quiet = np.abs(full[:, int(0.97 * full.shape[1]):]) ** 2
-    force_noise = np.broadcast_to(np.minimum(quiet.mean(), 1e-6 * (np.abs(full[:, lines]) ** 2).mean()), (len(records), len(lines)))
+    force_noise = np.full((len(records), len(lines)), _force_noise(case, full, lines, block, share))
     return Spectra(tuple(r.name for r in records), "burst", block, case.rate, alpha, lines, np.ones(len(lines), dtype=bool),
-                   full[:, lines], response, np.broadcast_to(noise, response.shape).copy(), force_noise.copy(), force,
+                   full[:, lines], response, np.broadcast_to(noise, response.shape).copy(), force_noise, force,
                    np.zeros((0, len(lines), response.shape[2]), dtype=complex),
                    np.array([r.level for r in records]), np.array([r.start for r in records]))
+
+
+def _force_noise(case: Case, full: Complex, lines: NDArray[np.int64], block: int, share: float) -> float:
+    """Variance of DFT/n of the force channel's noise: from the record with the shaker off, else from where the bursts have no power."""
+    offs = [r for r in case.records if r.kind == "off" and not r.sealed and len(r.force) > 64 and r.force.std() > 0]
+    if offs:
+        # differences of neighbours: an offset or a slow drift is not noise
+        return float(np.mean(np.diff(offs[0].force) ** 2) / 2 / block * share)
+    quiet = np.abs(full[:, int(0.97 * full.shape[1]):]) ** 2
+    return float(min(quiet.mean(), 1e-6 * (np.abs(full[:, lines]) ** 2).mean()))
+
+
+def _decay(stack: Array, psd: Array, case: Case) -> float:
+    """Rate (1/s) of the exponential window that keeps what still rings at the end of bursts (R, n, S) below a fifth of the noise of a line.
+
+    An end that is cut off leaks its amplitude over 2π to the next line. A ring too faint for the eye is looked for line by line in the
+    last quarter. With the window the same model holds at s + alpha, exactly.
+    """
+    block = stack.shape[1]
+    piece = stack[:, -(block // 4):] * np.hanning(block // 4)[:, None]
+    f = np.arange(piece.shape[1] // 2 + 1) * case.rate / piece.shape[1]
+    inside = (f > 0.8 * case.band[0]) & (f < 1.1 * case.band[1])
+    noise = np.stack([np.interp(f[inside], np.linspace(0, case.rate / 2, len(psd)), psd[:, i]) for i in range(psd.shape[1])], axis=1)
+    power = (np.abs(np.fft.rfft(piece, axis=1)[:, inside]) ** 2).max(0) / (0.375 * piece.shape[1])
+    ratio = float((power / np.maximum(noise, 1e-300)).max())
+    if ratio < 25:                                        # the largest of some thousand values of noise alone stays below
+        return 0.0
+    leak = np.sqrt(ratio * 4) / np.pi
+    return float(np.log(leak / 0.2)) * case.rate / block
 
 
 def noise_density(case: Case, steady: Spectra | None, points: int = 257) -> tuple[Array, str]:
@@ -184,8 +206,10 @@ def noise_density(case: Case, steady: Spectra | None, points: int = 257) -> tupl
         position = np.arange(1, len(power) + 1) / (block / 2)
         how = "quietest stretch of the longest record"
     if how != "scatter between periods":
-        # a variance from m values makes what is divided by it m/(m − 1) times too large on average
-        power = local_mean(power, max(6, len(power) // 64))
+        # Few lines in a mean: sharp where noise makes the structure ring. What is divided by a variance from m values is m/(m − 1) times
+        # too large on average.
+        count = 13 + len(power) // points
+        power = local_mean(power, 6) * count / (count - 1)
     edges = np.linspace(0, 1, points + 1)
     out = np.empty((points, power.shape[1]))
     previous = power[:max(3, len(power) // points)].mean(0)
