@@ -45,7 +45,7 @@ def test_truth_conserves_energy_and_meets_its_backbone() -> None:
 
 
 def test_smoke(tmp_path) -> None:
-    result = run("static", "white", 2, 1)
+    result = run("static", "white", 1, 1)
     assert keep(result, tmp_path).exists() and "cover" in line(result)
     assert result["seed"] == 1 and "numpy" in result["versions"] and result["refused"] == 0
     assert max(result["length_over_known"]) < 1.6

@@ -1,0 +1,33 @@
+"""CPU time of every test, children included: wall clock tells little on a busy machine. The dearest are listed after each run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+SHOWN = 15
+LEAST = 0.5  # s
+SPENT = pytest.StashKey[dict[str, float]]()
+
+
+def _cpu() -> float:
+    return float(sum(os.times()[:4]))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    begun = _cpu()
+    try:
+        return (yield)
+    finally:
+        item.config.stash.setdefault(SPENT, {})[item.nodeid] = _cpu() - begun
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    spent = config.stash.get(SPENT, {})
+    dear = sorted(((s, name) for name, s in spent.items() if s >= LEAST), reverse=True)[:SHOWN]
+    terminalreporter.write_line(f"CPU time: {_cpu():.0f} s in all, {sum(spent.values()):.0f} s of it in {len(spent)} tests")
+    for seconds, name in dear:
+        terminalreporter.write_line(f"{seconds:6.1f} s  {name}")
