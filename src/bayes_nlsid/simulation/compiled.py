@@ -121,8 +121,8 @@ def one_entry(at: At, w: np.ndarray, walks: Walks, e: int, n: int, q: float, v: 
             w[at.origin + e, n], w[at.base + e, n], w[at.half + e, n], w[at.far + e, n] = origin, base, half, far
     elif kind == SLIDERS:
         s = walks.table[e, SLOT]
-        f, fq = sliders_walk(walks.theta[s, n], walks.stiffness[s, n], walks.slip[s, n], last, walks.stretch[s, n],
-                             walks.sliding[s, n], q, v, walks.dt, write)
+        f, fq = sliders_walk(walks.theta[s, n], walks.stiffness[s, :, n], walks.slip[s, :, n], last, walks.stretch[s, :, n],
+                             walks.sliding[s, :, n], q, v, walks.dt, write)
     else:
         f, fq = bouc_wen_walk(p, last, q, v, walks.dt, write)
     if write:
@@ -138,6 +138,50 @@ def _on_branch(at: At, w: np.ndarray, e: int, q: Any, v: Any) -> int:
     ahead = heading * (q - load(w, at.last + e)) > 0.0
     open_ = heading * (q - load(w, at.far + e)) < 0.0
     return int(lanes_of(ahead & open_ & (load(w, at.last + at.entries + e) * v >= 0.0)))
+
+
+@inline
+def _runs_on(at: At, w: np.ndarray, e: int, v: Any) -> Any:
+    """Lanes in which the motion at an entry does not turn round."""
+    return load(w, at.last + at.entries + e) * v >= 0.0
+
+
+@inline
+def _slide(move: Any, stretch: Any, sliding: Any, slip: Any, theta: Any) -> tuple[Any, Any]:
+    """``memory.slider_step`` in all lanes."""
+    tried = stretch + move
+    carries_on = (size(sliding) > 0.5) & (sliding * move >= 0.0)
+    after = choose(carries_on, sliding, choose(size(tried) > slip, signed(spread(1.0), tried), spread(0.0)))
+    return choose(size(after) > 0.5, after * (theta * slip), tried), after
+
+
+@inner
+def _sliders(at: At, w: np.ndarray, walks: Walks, e: int, q: int) -> None:
+    """Force and tangent of all sliders of an entry into the spare rows, right where the motion does not turn; q: row of displacement."""
+    s, count = walks.table[e, SLOT], walks.slip.shape[1]
+    move, theta = load(w, q) - load(w, at.last + e), load(walks.theta, s)
+    force, tangent = spread(0.0), spread(0.0)
+    for j in range(s * count, (s + 1) * count):
+        stiffness = load(walks.stiffness, j)
+        there, way = _slide(move, load(walks.stretch, j), load(walks.sliding, j), load(walks.slip, j), theta)
+        force = force + stiffness * there
+        tangent = tangent + choose(size(way) > 0.5, spread(0.0), stiffness)
+    store(w, at.spare, force)
+    store(w, at.spare + 1, tangent)
+    store(w, at.spare + 2, 0.0)
+
+
+@inner
+def _carry_sliders(at: At, w: np.ndarray, walks: Walks, e: int, q: int, v: int) -> int:
+    """Carry the sliders of an entry on where the motion does not turn; returns those lanes as bits."""
+    s, count = walks.table[e, SLOT], walks.slip.shape[1]
+    move, theta, on = load(w, q) - load(w, at.last + e), load(walks.theta, s), _runs_on(at, w, e, load(w, v))
+    for j in range(s * count, (s + 1) * count):
+        stretch, sliding = load(walks.stretch, j), load(walks.sliding, j)
+        there, way = _slide(move, stretch, sliding, load(walks.slip, j), theta)
+        store(walks.stretch, j, choose(on, there, stretch))
+        store(walks.sliding, j, choose(on, way, sliding))
+    return int(lanes_of(on))
 
 
 @inner
@@ -175,6 +219,12 @@ def evaluate(at: At, w: np.ndarray, walks: Walks, table: np.ndarray, q: int, v: 
                 store(w, at.spare, force)
                 store(w, at.spare + 1, slope)
                 store(w, at.spare + 2, 0.0)
+        elif table[e, KIND] == SLIDERS:
+            _sliders(at, w, walks, e, q + r)
+            spring, on = load(w, at.spring + e), int(lanes_of(_runs_on(at, w, e, load(w, v + r))))
+            force, slope = load(w, at.spare) - spring * load(w, q + r), load(w, at.spare + 1) - spring
+            store(w, at.spare, force)
+            store(w, at.spare + 1, slope)
         else:
             force, slope = spread(0.0), spread(0.0)
         if on != ALL:
@@ -188,10 +238,10 @@ def evaluate(at: At, w: np.ndarray, walks: Walks, table: np.ndarray, q: int, v: 
 @inner
 def _turn(at: At, w: np.ndarray, walks: Walks, e: int, on: int, q: int, v: int) -> int:
     """Carry an entry's history on lane by lane where the bit of ``on`` is not set; returns the deepest stack."""
-    deepest, masing = 0, walks.table[e, KIND] == MASING
+    deepest, together = 0, walks.table[e, KIND] != BOUC_WEN
     for n in range(WIDTH):
-        # lanes that only fill the vector need no history but where they are compared with their branch
-        if on & (1 << n) == 0 and (n < at.filled or masing):
+        # lanes that only fill the vector need no history but where all lanes go together
+        if on & (1 << n) == 0 and (n < at.filled or together):
             one_entry(at, w, walks, e, n, w[q, n], w[v, n], 1.0)
             deepest = max(deepest, walks.depth[e, n])
     return deepest
@@ -204,10 +254,14 @@ def commit(at: At, w: np.ndarray, walks: Walks, table: np.ndarray, q: int, v: in
     for e in range(at.entries):
         kind, r = table[e, KIND], table[e, ROW]
         if kind != STATIC:
-            on = _on_branch(at, w, e, load(w, q + r), load(w, v + r)) if kind == MASING else 0
+            on = 0
+            if kind == MASING:
+                on = _on_branch(at, w, e, load(w, q + r), load(w, v + r))
+            elif kind == SLIDERS:
+                on = _carry_sliders(at, w, walks, e, q + r, v + r)
             if on != ALL:
                 deepest = max(deepest, _turn(at, w, walks, e, on, q + r, v + r))
-            if kind == MASING:  # harmless where the scalar step has done it already
+            if kind != BOUC_WEN:  # harmless where the scalar step has done it already
                 store(w, at.last + e, load(w, q + r))
                 store(w, at.last + at.entries + e, load(w, v + r))
     return deepest

@@ -80,7 +80,7 @@ class At(NamedTuple):
 class Walks(NamedTuple):
     """What is followed lane by lane: kind, code, row, quick and slot of every entry (table (E, 5)), power (E,), p (E, 8, 6), depth (E, 8),
     ends and forces (E, 8, room) of open reversals; sliders of the entries with a slot: theta (s, 8), stiffness, slip, stretch, sliding
-    (s, 8, sliders); counts (2, 8): iterations and failures; clock (2,): steps done and the deepest stack; work (12 + R, at least R and 4):
+    (s, sliders, 8); counts (2, 8): iterations and failures; clock (2,): steps done and the deepest stack; work (12 + R, at least R and 4):
     scratch of one lane."""
 
     dt: float
@@ -171,7 +171,7 @@ class Block:
             table[e] = KINDS[entry.term.memory], code, entry.row, found is not None, sliders.index(e) if e in sliders else -1
         self.rows("half", count)[:] = 1.0
         made = [iwan_sliders(entries[e].p[self.which]) for e in sliders]
-        stiffness, slip = (np.stack([x[i] for x in made]) if made else np.zeros((0, LANES, 0)) for i in (0, 1))
+        stiffness, slip = (np.ascontiguousarray(np.stack([x[i].T for x in made])) if made else np.zeros((0, 0, LANES)) for i in (0, 1))
         theta = np.stack([np.broadcast_to(x[2][:, 0], (LANES,)) for x in made]) if made else np.zeros((0, LANES))
         stacks = np.zeros((2, count, LANES, ROOM))
         return Walks(dt, table, np.array([c[1] for c in codes], dtype=float), p, np.zeros((count, LANES), dtype=np.int64), stacks[0],
