@@ -53,7 +53,7 @@ def test_a_plan_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert gains == sorted(gains, reverse=True) and plan["excitations"][-1]["level_n"] == 0.05
     assert [p["word"] for p in plan["parameters"]] == ["learned", "learned"] and plan["cannot_be_learned"] == []
     page = (tmp_path / "out" / "plan.html").read_text()
-    assert "Excitations, the best first" in page and page.count("data:image/png") == 2 and "http" not in page
+    assert "Excitations, the best first" in page and page.count("data:image/png") == 2 and "http:" not in page and "https:" not in page
     assert {p.name for p in (tmp_path / "out" / "figures").iterdir()} == {"plan_levels.png", "plan_sensors.png"}
 
 
