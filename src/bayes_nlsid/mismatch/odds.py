@@ -3,7 +3,7 @@
 What a wrong model leaves over is model error, not noise, so likelihood ratios are no probabilities (they run to thousands of nats). A
 hypothesis is held against its best rival by the difference of their block scores measured in its own standard error over blocks, and
 the odds fall with a power of that ratio, not exponentially: a difference that every block shares counts, one that rests on few blocks
-does not. The numbers were set on simulated oscillators and chains (`tests/mismatch/test_recorded.py`), not on the recordings in `data/`.
+does not. The numbers were set by hand; nothing has calibrated them yet.
 """
 
 from __future__ import annotations
