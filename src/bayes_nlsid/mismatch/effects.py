@@ -33,10 +33,12 @@ class Effect:
     law : Law or None
         For forces.
     values : ndarray
-        Parameters of the law's term, or of the linear effect (``names``); for a drift the coefficients of time and its square.
+        Parameters of the law's term, or of the linear effect (``names``); for a drift the stiffness at each of ``knots``, N/m.
     names, units : tuple of str
     kind : str
         Variant of a linear effect (``maxwell``, ``crosstalk`` for class ``other``).
+    knots : ndarray
+        Of a drift: times of the fitted records on the scale of the test day (−1 to 1). It holds its value before and after.
     """
 
     cls: str
@@ -46,6 +48,7 @@ class Effect:
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     kind: str = ""
+    knots: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def is_force(self) -> bool:

@@ -129,9 +129,12 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
                     candidates.append(best)
         if np.ptp(spectra.starts) > 0:
             D = np.array([m[spectra.lines, j] for m in motions])
-            columns = np.array([D * tau[:, None], D * (tau ** 2)[:, None]])
-            gain, coefficients = _regress(evidence, columns, z, weight)
-            candidates.append(Candidate(Effect("stiffness_drift", place, None, coefficients, ("trend", "curvature"), ("N/m", "N/m")), gain))
+            # a stiffness of its own in every record: drifts may creep, jump or settle; their mean is the linear model's
+            order = np.argsort(tau)
+            gain, values = _regress(evidence, D[None] * np.eye(len(tau))[order][:, :, None], z, weight)
+            names = tuple(f"at {spectra.starts[r]:g} s" for r in order)
+            candidates.append(Candidate(Effect("stiffness_drift", place, None, values - values.mean(), names, ("N/m",) * len(tau), "",
+                                               tau[order]), gain))
     candidates.sort(key=lambda c: -c.gain)
     return candidates, latents, scale
 

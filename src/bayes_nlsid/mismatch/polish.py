@@ -91,7 +91,7 @@ class Hypothesis:
 def law_of(effect: Effect, time: float, periodic: bool) -> LawAlong:
     """The force of an effect along a motion, in a record taken at ``time`` (−1 to 1 over the test day of the fitted records)."""
     if effect.law is None:
-        stiffness = float(effect.values @ np.array([time, time ** 2]))
+        stiffness = float(np.interp(time, effect.knots, effect.values))
         return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))))
     force = partial(_along, effect, periodic)
     return LawAlong(force, None if effect.law.term.memory != "none" else partial(_slope, effect))
