@@ -131,7 +131,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
             D = np.array([m[spectra.lines, j] for m in motions])
             # a stiffness of its own in every record: drifts may creep, jump or settle; their mean is the linear model's
             order = np.argsort(tau)
-            gain, values = _regress(evidence, D[None] * np.eye(len(tau))[order][:, :, None], z, weight)
+            gain, values = _regress(evidence, D[None] * np.eye(len(tau), dtype=complex)[order][:, :, None], z, weight)
             names = tuple(f"at {spectra.starts[r]:g} s" for r in order)
             candidates.append(Candidate(Effect("stiffness_drift", place, None, values - values.mean(), names, ("N/m",) * len(tau), "",
                                                tau[order]), gain))
