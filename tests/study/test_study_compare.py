@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import arviz
 import numpy as np
 import pytest
 
@@ -31,6 +30,7 @@ def test_from_nothing_to_the_sentence(study: Path, tmp_path: Path, capsys: pytes
     assert other["told_from_best"] and other["elpd_difference"] < -100 and other["elpd_se"] > 0
     assert said["sentence"][:40] in capsys.readouterr().out.replace("\n", " ")
     assert "Alternatives compared" in (out / "report.html").read_text(encoding="utf-8")
+    import arviz  # here, where its daily notice has been given to the package
     data = arviz.from_netcdf(out / "compare_0.nc")
     assert data.log_likelihood["heldout"].shape == (1, 30, len(said["blocks"])) and "cubic[x].c" in data.posterior
     with np.load(out / "compare.npz") as file:
