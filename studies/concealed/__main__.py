@@ -1,4 +1,4 @@
-"""``python -m studies.concealed generate | run | score | refit``."""
+"""``python -m studies.concealed generate | run | score``."""
 
 from __future__ import annotations
 
@@ -29,10 +29,6 @@ def main(arguments: list[str] | None = None) -> int:
     s.add_argument("--results", type=Path, required=True)
     s.add_argument("--answers", type=Path, required=True)
     s.add_argument("--out", type=Path, required=True, help="a .md file; a .json of the same name is written beside it")
-    f = todo.add_parser("refit", help="weights of the layer that turns scores into probabilities")
-    f.add_argument("--results", type=Path, required=True, nargs="+")
-    f.add_argument("--answers", type=Path, required=True, nargs="+")
-    f.add_argument("--spread", type=float, default=1.0, help="standard deviation of the weights around those set by hand")
     options = parser.parse_args(arguments)
     if options.command == "generate":
         from .generate import generate
@@ -42,11 +38,6 @@ def main(arguments: list[str] | None = None) -> int:
         from .run import run
 
         return run(options.cases, options.out, options.workers, options.seed, options.timeout, options.tool)
-    if options.command == "refit":
-        from .refit import refit
-
-        refit(options.results, options.answers, options.spread)
-        return 0
     from .score import score_files
 
     return score_files(options.results, options.answers, options.out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
@@ -49,3 +50,17 @@ def refit(results: list[Path], answers: list[Path], spread: float = 1.0, folds: 
           f"on all {log_loss(final, scores, truths):.3f}")
     print(", ".join(f"{name.replace(' ', '_')}={weight:.3f}" for name, weight in zip(FEATURES, final.weights, strict=True)))
     return final
+
+
+def main() -> None:
+    """``python -m studies.refit_layer --results DIR… --answers DIR…``."""
+    parser = argparse.ArgumentParser(prog="python -m studies.refit_layer", description=__doc__)
+    parser.add_argument("--results", type=Path, required=True, nargs="+")
+    parser.add_argument("--answers", type=Path, required=True, nargs="+")
+    parser.add_argument("--spread", type=float, default=1.0, help="standard deviation of the weights around those set by hand")
+    options = parser.parse_args()
+    refit(options.results, options.answers, options.spread)
+
+
+if __name__ == "__main__":
+    main()
