@@ -98,3 +98,16 @@ def test_a_hum_out_of_step_with_the_record_is_taken_out() -> None:
     hum = np.stack([5 * np.cos(2 * np.pi * 50.017 * t + 0.3), 2 * np.cos(2 * np.pi * 100.034 * t)], axis=1)
     found = tones(other + hum, 50.0, 1024.0)
     assert (np.abs(found - hum).std(0) < 0.05 * hum.std(0)).all()
+
+
+@pytest.mark.parametrize("law", STATIC)
+def test_every_law_runs_compiled(law: Law) -> None:
+    """The scalar code is the law itself, so that no class of the catalogue is stepped slowly."""
+    compiled = pytest.importorskip("bayes_nlsid.forces.compiled")
+    code = compiled.law_code(law.term)
+    assert code is not None
+    for p in law.shapes(SIZE):
+        for q in 1e-5 * np.array([-3.3, -0.4, 0.0, 0.9, 40.0]):
+            for v in 1e-2 * np.array([-1.1, 0.0, 0.3]):
+                expected = [float(np.asarray(x)) for x in (law.term.law(q, v, *p), *law.term.slope(q, v, *p))]
+                np.testing.assert_allclose(compiled.law_value(*code, q, v, p), expected, rtol=1e-12, atol=1e-15)

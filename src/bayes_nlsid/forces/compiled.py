@@ -1,4 +1,5 @@
-"""Compiled loops and scalar building blocks, made from the very functions of ``forces/laws.py`` and ``forces/memory.py``.
+"""Compiled loops and scalar building blocks, made from the very functions of ``forces/laws.py``, ``forces/joint_laws.py``
+and ``forces/memory.py``.
 
 Import this module only where compiled code is about to run: it imports numba (0.3 s).
 """
@@ -18,7 +19,7 @@ import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.forces import laws, memory
+from bayes_nlsid.forces import joint_laws, laws, memory
 from bayes_nlsid.forces.term import Term
 
 
@@ -34,7 +35,7 @@ def cache_directory(source: str) -> str:
         File of the function to compile.
     """
     digest = hashlib.sha256(numba.__version__.encode())
-    for module in (laws.__file__, memory.__file__, __file__, source):
+    for module in (laws.__file__, joint_laws.__file__, memory.__file__, __file__, source):
         digest.update(Path(module).read_bytes())
     beside, home = Path(__file__).parent / "__pycache__", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "bayes_nlsid"
     given = os.environ.get("NUMBA_CACHE_DIR")
@@ -75,9 +76,16 @@ _FAMILIES: tuple[Callable[..., Any], ...] = (laws.displacement_odd, laws.displac
                                              laws.velocity_odd, laws.velocity_even)
 _PLAIN: tuple[Callable[..., Any], ...] = (laws.spring, laws.dashpot, laws.jenkins, laws.jenkins_prager, laws.clearance, laws.iwan4,
                                           laws.iwan5)
-for _law in (*_FAMILIES, *_PLAIN):
-    numba.extending.register_jitable(_law)
-    numba.extending.register_jitable(getattr(laws, f"{_law.__name__}_slope"))
+_OF_JOINTS: tuple[Callable[..., Any], ...] = (
+    joint_laws.power_spring, joint_laws.falling_spring, joint_laws.levelling, joint_laws.saturating, joint_laws.rounded_gap,
+    joint_laws.one_stop, joint_laws.two_stops, joint_laws.one_sided, joint_laws.bent, joint_laws.closing, joint_laws.rounded_friction,
+    joint_laws.falling_friction, joint_laws.power_damper)
+for _block in (joint_laws.soft, joint_laws.step):
+    numba.extending.register_jitable(_block)
+for _module, _group in ((laws, (*_FAMILIES, *_PLAIN)), (joint_laws, _OF_JOINTS)):
+    for _law in _group:
+        numba.extending.register_jitable(_law)
+        numba.extending.register_jitable(getattr(_module, f"{_law.__name__}_slope"))
 
 
 def law_code(term: Term) -> tuple[int, float] | None:
@@ -90,12 +98,56 @@ def law_code(term: Term) -> tuple[int, float] | None:
     Returns
     -------
     tuple of (int, float) or None
-        None if the law is not one of ``forces/laws.py``: a user's own, which runs in numpy.
+        None if the law is neither of ``forces/laws.py`` nor of ``forces/joint_laws.py``: a user's own, which runs in numpy.
     """
     law = term.law
     if isinstance(law, partial) and law.func in _FAMILIES and set(law.keywords) == {"power"}:
         return _FAMILIES.index(law.func), float(law.keywords["power"])
-    return (len(_FAMILIES) + _PLAIN.index(law), 0.0) if law in _PLAIN else None
+    single = (*_PLAIN, *_OF_JOINTS)
+    return (len(_FAMILIES) + single.index(law), 0.0) if law in single else None
+
+
+@compiled
+def _joint_law_value(code: int, q: float, v: float, p: NDArray[np.float64]) -> tuple[float, float, float]:
+    """As ``law_value`` for the laws of ``forces/joint_laws.py``, counted from their first."""
+    if code == 0:
+        slope = joint_laws.power_spring_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.power_spring(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 1:
+        slope = joint_laws.falling_spring_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.falling_spring(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 2:
+        slope = joint_laws.levelling_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.levelling(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 3:
+        slope = joint_laws.saturating_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.saturating(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 4:
+        slope = joint_laws.rounded_gap_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.rounded_gap(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 5:
+        slope = joint_laws.one_stop_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.one_stop(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 6:
+        slope = joint_laws.two_stops_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.two_stops(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    if code == 7:
+        slope = joint_laws.one_sided_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.one_sided(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 8:
+        slope = joint_laws.bent_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.bent(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    if code == 9:
+        slope = joint_laws.closing_slope(q, v, p[0], p[1])
+        return joint_laws.closing(q, v, p[0], p[1]), slope[0], slope[1]
+    if code == 10:
+        slope = joint_laws.rounded_friction_slope(q, v, p[0], p[1])
+        return joint_laws.rounded_friction(q, v, p[0], p[1]), slope[0], slope[1]
+    if code == 11:
+        slope = joint_laws.falling_friction_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.falling_friction(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    slope = joint_laws.power_damper_slope(q, v, p[0], p[1], p[2])
+    return joint_laws.power_damper(q, v, p[0], p[1], p[2]), slope[0], slope[1]
 
 
 @compiled
@@ -147,8 +199,10 @@ def law_value(code: int, power: float, q: float, v: float, p: NDArray[np.float64
     if code == 11:
         slope = laws.iwan4_slope(q, v, p[0], p[1], p[2], p[3])
         return laws.iwan4(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
-    slope = laws.iwan5_slope(q, v, p[0], p[1], p[2], p[3], p[4])
-    return laws.iwan5(q, v, p[0], p[1], p[2], p[3], p[4]), slope[0], slope[1]
+    if code == 12:
+        slope = laws.iwan5_slope(q, v, p[0], p[1], p[2], p[3], p[4])
+        return laws.iwan5(q, v, p[0], p[1], p[2], p[3], p[4]), slope[0], slope[1]
+    return _joint_law_value(code - 13, q, v, p)
 
 
 # --- memory, one sample at a time ---------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces import joint_laws
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.parameter import Param
 from bayes_nlsid.forces.term import Term
@@ -72,77 +73,51 @@ def _grid(*axes: Array) -> Array:
     return np.stack([m.ravel() for m in mesh], axis=-1)
 
 
-def _soft(y: Array) -> Array:
-    return np.asarray(np.logaddexp(0.0, y))
-
-
-def _step(y: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-np.clip(y, -700, 700))))
-
-
 POWER_SPRING = Term("power_spring", "f*sign(q)*(abs(q)/d)**n",
                     (Param("f", "N", "force", meaning="force at d"), Param("d", "m", "displacement", meaning="reference, fixed"),
                      Param("n", "", "range", 1.2, 9.0, "exponent")),
-                    lambda q, v, f, d, n: f * np.sign(q) * (np.abs(q) / d) ** n,
-                    lambda q, v, f, d, n: (f * n / d * (np.abs(q) / d) ** (n - 1), 0 * q), linear=False,
+                    joint_laws.power_spring, joint_laws.power_spring_slope, linear=False,
                     meaning="spring that stiffens like a power of displacement")
 
 LEVELLING = Term("levelling_spring", "k*q*(abs(q)/d)**m/(1 + (abs(q)/d)**m)",
                  (Param("k", "N/m", "stiffness", meaning="stiffness gained at large motion"),
                   Param("d", "m", "displacement", meaning="motion at which half of it is there"),
                   Param("m", "", "range", 0.5, 4.0, "sharpness")),
-                 lambda q, v, k, d, m: k * q * (np.abs(q) / d) ** m / (1 + (np.abs(q) / d) ** m),
-                 lambda q, v, k, d, m: (k * (np.abs(q) / d) ** m * (1 + m + (np.abs(q) / d) ** m) / (1 + (np.abs(q) / d) ** m) ** 2, 0 * q),
-                 meaning="spring that stiffens with displacement and levels off")
+                 joint_laws.levelling, joint_laws.levelling_slope, meaning="spring that stiffens with displacement and levels off")
 
 SATURATING = Term("saturating_spring", "-k*q*(abs(q)/d)**m/(1 + (abs(q)/d)**m)",
                   (Param("k", "N/m", "stiffness", meaning="stiffness lost at large motion"),
                    Param("d", "m", "displacement", meaning="motion at which half of it is lost"),
                    Param("m", "", "range", 0.5, 4.0, "sharpness")),
-                  lambda q, v, k, d, m: -k * q * (np.abs(q) / d) ** m / (1 + (np.abs(q) / d) ** m),
-                  lambda q, v, k, d, m: (-k * (np.abs(q) / d) ** m * (1 + m + (np.abs(q) / d) ** m) / (1 + (np.abs(q) / d) ** m) ** 2,
-                                         0 * q),
+                  joint_laws.saturating, joint_laws.saturating_slope,
                   meaning="spring that softens with displacement and returns on the same line")
 
 FALLING = Term("falling_spring", "-f*sign(q)*(abs(q)/d)**n",
                (Param("f", "N", "force", meaning="force lost at d"), Param("d", "m", "displacement", meaning="reference, fixed"),
                 Param("n", "", "range", 1.2, 5.0, "exponent")),
-               lambda q, v, f, d, n: -f * np.sign(q) * (np.abs(q) / d) ** n,
-               lambda q, v, f, d, n: (-f * n / d * (np.abs(q) / d) ** (n - 1), 0 * q),
-               meaning="spring that loses a power of displacement")
+               joint_laws.falling_spring, joint_laws.falling_spring_slope, meaning="spring that loses a power of displacement")
 
 ROUNDED_GAP = Term("rounded_gap", "k*w*e*(log(1 + exp((q - e)/(w*e))) - log(1 + exp((-q - e)/(w*e))))",
                    (Param("k", "N/m", "stiffness", meaning="stiffness in contact"), Param("e", "m", "displacement", meaning="gap"),
                     Param("w", "", "range", 0.01, 0.6, "rounding over the gap")),
-                   lambda q, v, k, e, w: k * w * e * (_soft((q - e) / (w * e)) - _soft((-q - e) / (w * e))),
-                   lambda q, v, k, e, w: (k * (_step((q - e) / (w * e)) + _step((-q - e) / (w * e))), 0 * q),
-                   meaning="gap on both sides with rough faces")
-
-def _stop_slope(y: Array, k: Array, n: Array) -> Array:
-    return np.asarray(k * n * np.where(y > 0, np.maximum(y, 1e-12) ** (n - 1), 0.0))
-
+                   joint_laws.rounded_gap, joint_laws.rounded_gap_slope, meaning="gap on both sides with rough faces")
 
 ONE_STOP = Term("one_stop", "k*e*max(sign(k)*q/e - 1, 0)**n",
                 (Param("k", "N/m", "coefficient", meaning="stiffness scale; negative: the stop is on the other side"),
                  Param("e", "m", "displacement", meaning="gap"), Param("n", "", "range", 1.0, 2.0, "exponent, 1.5 for a round body")),
-                lambda q, v, k, e, n: k * e * np.maximum(np.sign(k) * q / e - 1, 0.0) ** n,
-                lambda q, v, k, e, n: (_stop_slope(np.sign(k) * q / e - 1, np.abs(k), n), 0 * q),
-                parity="none", meaning="stop on one side beyond a gap")
+                joint_laws.one_stop, joint_laws.one_stop_slope, parity="none", meaning="stop on one side beyond a gap")
 
 TWO_STOPS = Term("two_stops", "k*(max(q - e, 0) - r*max(-q - u*e, 0))",
                  (Param("k", "N/m", "stiffness", meaning="stiffness of the stop at e"), Param("e", "m", "displacement", meaning="gap"),
                   Param("r", "", "range", 0.05, 20.0, "stiffness of the other stop over this one"),
                   Param("u", "", "range", 0.2, 5.0, "gap on the other side over this one")),
-                 lambda q, v, k, e, r, u: k * (np.maximum(q - e, 0.0) - r * np.maximum(-q - u * e, 0.0)),
-                 lambda q, v, k, e, r, u: (k * (np.where(q > e, 1.0, 0.0) + r * np.where(-q > u * e, 1.0, 0.0)), 0 * q),
-                 parity="none", meaning="unequal stops on both sides")
+                 joint_laws.two_stops, joint_laws.two_stops_slope, parity="none", meaning="unequal stops on both sides")
 
 ONE_SIDED = Term("one_sided_spring", "k*where(q > e*d, q - e*d, 0)",
                  (Param("k", "N/m", "coefficient", meaning="stiffness on one side"),
                   Param("e", "", "range", -3.0, 3.0, "where it begins, over d"),
                   Param("d", "m", "displacement", meaning="reference, fixed")),
-                 lambda q, v, k, e, d: k * np.where(q > e * d, q - e * d, 0.0),
-                 lambda q, v, k, e, d: (k * np.where(q > e * d, 1.0, 0.0), 0 * q), parity="none",
+                 joint_laws.one_sided, joint_laws.one_sided_slope, parity="none",
                  meaning="stiffness that differs between opening and closing")
 
 BENT = Term("bent_spring", "k*d*(sqrt((q/d - e)**2 + w**2) - sqrt(e**2 + w**2))/2",
@@ -150,50 +125,32 @@ BENT = Term("bent_spring", "k*d*(sqrt((q/d - e)**2 + w**2) - sqrt(e**2 + w**2))/
              Param("e", "", "range", -3.0, 3.0, "where it changes, over d"),
              Param("w", "", "range", 0.02, 20.0, "over how much motion, over d"),
              Param("d", "m", "displacement", meaning="reference, fixed")),
-            lambda q, v, k, e, w, d: 0.5 * k * d * (np.sqrt((q / d - e) ** 2 + w ** 2) - np.sqrt(e ** 2 + w ** 2)),
-            lambda q, v, k, e, w, d: (0.5 * k * (q / d - e) / np.sqrt((q / d - e) ** 2 + w ** 2), 0 * q), parity="none",
+            joint_laws.bent, joint_laws.bent_slope, parity="none",
             meaning="stiffness that changes gradually from one direction to the other")
-
-
-def _exponential(q: Array, k: Array, d: Array) -> tuple[Array, Array]:
-    """Force and slope of rough faces that close, straight beyond three times their length."""
-    y = np.clip(q / d, -30.0, 3.0)
-    grown = np.expm1(y)
-    return k * np.abs(d) * (grown - y + (q / d - y) * grown), k * np.sign(d) * grown
-
 
 CLOSING = Term("closing_faces", "k*abs(d)*(exp(q/d) - 1 - q/d)",
                (Param("k", "N/m", "coefficient", meaning="stiffness scale"),
                 Param("d", "m", "coefficient", meaning="length over which the faces close; its sign is the direction")),
-               lambda q, v, k, d: _exponential(q, k, d)[0], lambda q, v, k, d: (_exponential(q, k, d)[1], 0 * q), parity="none",
+               joint_laws.closing, joint_laws.closing_slope, parity="none",
                meaning="rough faces whose stiffness grows exponentially as they close")
 
 FRICTION = Term("rounded_friction", "f*tanh(v/w)",
                 (Param("f", "N", "force", meaning="sliding force"), Param("w", "m/s", "velocity", meaning="velocity of rounding")),
-                lambda q, v, f, w: f * np.tanh(v / w),
-                lambda q, v, f, w: (0 * q, f / w / np.cosh(np.clip(v / w, -300, 300)) ** 2), dissipative=True,
+                joint_laws.rounded_friction, joint_laws.rounded_friction_slope, dissipative=True,
                 meaning="dry friction, rounded at rest")
-
-
-def _slow_slope(v: Array, f: Array, w: Array, a: Array, s: Array) -> Array:
-    root, fall = np.sqrt(v ** 2 + w ** 2), a * np.exp(-np.abs(v) / (s * w))
-    return np.asarray(f * (w ** 2 / root ** 3 * (1 + fall) - np.abs(v) / root * fall / (s * w)))
-
 
 SLOW_FRICTION = Term("falling_friction", "f*v/sqrt(v**2 + w**2)*(1 + a*exp(-abs(v)/(s*w)))",
                      (Param("f", "N", "force", meaning="sliding force at speed"),
                       Param("w", "m/s", "velocity", meaning="velocity of rounding"),
                       Param("a", "", "range", 0.0, 2.0, "how much higher it is when slow"),
                       Param("s", "", "range", 1.0, 100.0, "velocity over w at which it has fallen")),
-                     lambda q, v, f, w, a, s: f * v / np.sqrt(v ** 2 + w ** 2) * (1 + a * np.exp(-np.abs(v) / (s * w))),
-                     lambda q, v, f, w, a, s: (0 * q, _slow_slope(v, f, w, a, s)), dissipative=True,
+                     joint_laws.falling_friction, joint_laws.falling_friction_slope, dissipative=True,
                      meaning="dry friction that falls with speed")
 
 POWER_DAMPER = Term("power_damper", "f*sign(v)*(abs(v)/w)**n",
                     (Param("f", "N", "force", meaning="force at w"), Param("w", "m/s", "velocity", meaning="reference, fixed"),
                      Param("n", "", "range", 1.2, 4.0, "exponent")),
-                    lambda q, v, f, w, n: f * np.sign(v) * (np.abs(v) / w) ** n,
-                    lambda q, v, f, w, n: (0 * q, f * n / w * (np.abs(v) / w) ** (n - 1)), dissipative=True,
+                    joint_laws.power_damper, joint_laws.power_damper_slope, dissipative=True,
                     meaning="damping that grows with velocity")
 
 LOOP = Term("bouc_wen_loop", "k*q",
