@@ -80,8 +80,8 @@ _OF_JOINTS: tuple[Callable[..., Any], ...] = (
     joint_laws.power_spring, joint_laws.falling_spring, joint_laws.levelling, joint_laws.saturating, joint_laws.rounded_gap,
     joint_laws.one_stop, joint_laws.two_stops, joint_laws.one_sided, joint_laws.bent, joint_laws.closing, joint_laws.rounded_friction,
     joint_laws.falling_friction, joint_laws.power_damper)
-for _block in (joint_laws.soft, joint_laws.step):
-    numba.extending.register_jitable(_block)
+for _part in (joint_laws.soft, joint_laws.step):
+    numba.extending.register_jitable(_part)
 for _module, _group in ((laws, (*_FAMILIES, *_PLAIN)), (joint_laws, _OF_JOINTS)):
     for _law in _group:
         numba.extending.register_jitable(_law)
