@@ -22,6 +22,7 @@ _PUBLIC = {
     "LappedBeam": "structure.beam", "lapped_beam": "structure.beam", "oscillator": "structure.chains", "Structure": "structure.structure",
     "SolidBeam": "structure.solid_beam", "solid_beam": "structure.solid_beam",
     "read_matrices": "structure.matrices", "guyan": "structure.reduction", "iirs": "structure.reduction",
+    "serep": "structure.bases", "craig_bampton": "structure.bases", "attachment_modes": "structure.bases",
     "identify_modes": "structure.identify", "polarity": "structure.polarity", "update": "structure.updating",
     "modal_model": "structure.modal_model", "ModalModel": "structure.modal", "modal_data": "structure.sensing",
            "ModalData": "structure.modal",

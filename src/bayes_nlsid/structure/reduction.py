@@ -8,7 +8,7 @@ the saddle-point matrix [K Aᵀ; A 0] then gives both the static shapes T_G (rig
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
 
 import numpy as np
@@ -70,17 +70,18 @@ class Reduced:
 
     def modes(self, count: int = 10) -> Modes:
         """Rigid and lowest elastic modes of the reduced model, shapes in the coordinates of the full model (N, m)."""
-        small = eigenmodes(self.K, self.M, min(count, self.size), self.rigid)
-        return Modes(self.T @ small.rigid, small.omega, self.T @ small.shapes)
+        return _small_modes(self.T, self.M, self.K, count, self.rigid)
 
 
 @final
 @dataclass(frozen=True)
 class Step:
-    """One iteration: relative frequency error and mass-weighted MAC of each elastic mode of the full model."""
+    """One iteration: relative frequency error and mass-weighted MAC of each elastic mode of the full model, and the share of each
+    joint's elastic static flexibility that is lost (negative: too soft), in the order of the structure's joints."""
 
     frequency_error: NDArray[np.float64]
     mac: NDArray[np.float64]
+    joint_loss: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def worst(self) -> float:
@@ -127,24 +128,23 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
     """
     if iterations < 0 or not 0 < tolerance or compare < 1:
         raise ValueError(f"iirs: iterations {iterations} must be >= 0, tolerance {tolerance} and compare {compare} positive")
-    names, A = _master_rows(structure, masters)
+    names, A = master_rows(structure, masters)
     full = modes(structure, compare)
-    constraint, notes = _unseen(structure, A, full.rigid, guard)
-    T_s, S = _statics(structure.K, A, constraint)
+    constraint, notes = unseen(structure, A, full.rigid, guard)
+    T_s, S = statics(structure.K, A, constraint)
     rigid = full.rigid.shape[1] - (0 if constraint is None else constraint.shape[0])
     count = min(len(full.omega), len(names) - rigid)
     if count < 1:
         raise ValueError(f"{len(names)} masters only follow the {rigid} rigid-body modes; add masters to follow elastic ones")
-    target = Modes(full.rigid, full.omega[:count], full.shapes[:, :count])
-    T, M_r, K_r = T_s, _project(structure.M, T_s), _project(structure.K, T_s)
-    history = [_compare(structure, target, T, (M_r, K_r), rigid)]
+    target = Target.of(structure, Modes(full.rigid, full.omega[:count], full.shapes[:, :count]), rigid)
+    T, M_r, K_r = T_s, project(structure.M, T_s), project(structure.K, T_s)
+    history = [target.step(T, M_r, K_r)]
     while len(history) <= iterations and not _met(history[-1], tolerance, least_mac):
         T = T_s + S(structure.M @ (T @ np.linalg.solve(M_r, K_r)))
-        M_r, K_r = _project(structure.M, T), _project(structure.K, T)
-        history.append(_compare(structure, target, T, (M_r, K_r), rigid))
-    status = "ok" if _met(history[-1], tolerance, least_mac) else _missed(history[-1], target, tolerance, least_mac)
-    return Reduced(structure, names, T, M_r, K_r, tuple(history), float(np.linalg.cond(M_r)),
-                   "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations", rigid, status, notes)
+        M_r, K_r = project(structure.M, T), project(structure.K, T)
+        history.append(target.step(T, M_r, K_r))
+    method = "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations"
+    return target.reduced(names, T, (M_r, K_r), history, method, notes, tolerance, least_mac)
 
 
 def without_rigid_body(reduced: Reduced) -> Reduced:
@@ -180,17 +180,19 @@ def static_flexibility(structure: Structure, rows: ArrayLike, rigid: NDArray[np.
     ndarray (L, L)
     """
     b = np.asarray(rows, dtype=float)
-    R = modes(structure, 1).rigid if rigid is None else rigid
-    MR = structure.M @ R
-    if R.shape[1] == 0:
-        x = factorise(structure.K)(np.ascontiguousarray(b.T))
-    else:
-        x = _saddle(structure.K, MR.T)(b.T - MR @ (R.T @ b.T), np.zeros((R.shape[1], len(b))))
-    G = b @ x
+    G = b @ inertia_relief(structure, b, modes(structure, 1).rigid if rigid is None else rigid)
     return np.asarray(0.5 * (G + G.T), dtype=float)
 
 
-def _master_rows(structure: Structure, masters: Sequence[str] | ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+def inertia_relief(structure: Structure, rows: NDArray[np.float64], rigid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Elastic static shapes (N, L) under unit forces at rows (L, N), balanced by the inertia of rigid motion (N, r), and free of it."""
+    if rigid.shape[1] == 0:
+        return np.asarray(factorise(structure.K)(np.ascontiguousarray(rows.T)))
+    MR = structure.M @ rigid
+    return np.asarray(_saddle(structure.K, MR.T)(rows.T - MR @ (rigid.T @ rows.T), np.zeros((rigid.shape[1], len(rows)))))
+
+
+def master_rows(structure: Structure, masters: Sequence[str] | ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64]]:
     if isinstance(masters, (list, tuple)) and all(isinstance(name, str) for name in masters):
         names = tuple(str(name) for name in masters)
         A = structure.rows(names)
@@ -207,7 +209,7 @@ def _master_rows(structure: Structure, masters: Sequence[str] | ArrayLike) -> tu
     return names, A
 
 
-def _unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.float64],
+def unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.float64],
             guard: Guard) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """Extra rows (k, N) that hold unseen rigid-body modes, and what to say about them."""
     if rigid.shape[1] == 0:
@@ -227,7 +229,7 @@ def _unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.floa
     return (structure.M @ hidden).T, (sentence + "; they are held still",)
 
 
-def _statics(K: Matrix, A: NDArray[np.float64], constraint: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], Any]:
+def statics(K: Matrix, A: NDArray[np.float64], constraint: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], Any]:
     """T_G (N, n) and the operator S, from one factorisation."""
     rows = A if constraint is None else np.vstack([A, constraint])
     solve = _saddle(K, rows)
@@ -251,20 +253,62 @@ def _saddle(K: Matrix, rows: NDArray[np.float64]) -> Any:
     return lambda f, d: solve(np.vstack([f, d * scale[:, None]]))[:n]
 
 
-def _project(matrix: Matrix, T: NDArray[np.float64]) -> NDArray[np.float64]:
+def project(matrix: Matrix, T: NDArray[np.float64]) -> NDArray[np.float64]:
     product = T.T @ (matrix @ T)
     return np.asarray(0.5 * (product + product.T), dtype=float)
 
 
-def _compare(structure: Structure, target: Modes, T: NDArray[np.float64], reduced: tuple[NDArray[np.float64], NDArray[np.float64]],
-             rigid: int) -> Step:
-    """Each full mode against the reduced mode that resembles it most."""
-    small = eigenmodes(reduced[1], reduced[0], len(reduced[0]), rigid)
-    if len(small.omega) == 0 or len(target.omega) == 0:
-        return Step(np.full(len(target.omega), np.inf), np.zeros(len(target.omega)))
-    likeness = mac(target.shapes, T @ small.shapes, structure.M)
-    best = likeness.argmax(axis=1)
-    return Step(small.omega[best] / target.omega - 1, likeness.max(axis=1))
+@final
+@dataclass(frozen=True)
+class Target:
+    """What a reduced model is measured against: elastic modes and static joint flexibility of the full structure."""
+
+    structure: Structure
+    modes: Modes
+    flexibility: NDArray[np.float64]    # (joints,) m/N
+    rigid: int                          # rigid-body modes the reduced model can move in
+
+    @classmethod
+    def of(cls, structure: Structure, full: Modes, rigid: int) -> Target:
+        rows = structure.rows(structure.joints)
+        return cls(structure, full, np.diag(static_flexibility(structure, rows, full.rigid)) if len(rows) else np.zeros(0), rigid)
+
+    def step(self, T: NDArray[np.float64], M: NDArray[np.float64], K: NDArray[np.float64]) -> Step:
+        """Each full mode against the reduced mode that resembles it most."""
+        small = _small_modes(T, M, K, len(M), self.rigid)
+        if len(small.omega) == 0 or len(self.modes.omega) == 0:
+            return Step(np.full(len(self.modes.omega), np.inf), np.zeros(len(self.modes.omega)), np.ones(len(self.flexibility)))
+        likeness = mac(self.modes.shapes, small.shapes, self.structure.M)
+        best = likeness.argmax(axis=1)
+        kept = np.sum((self.structure.rows(self.structure.joints) @ small.shapes / small.omega) ** 2, axis=1)
+        loss = 1 - np.divide(kept, self.flexibility, out=np.ones(len(kept)), where=self.flexibility > 0)
+        return Step(small.omega[best] / self.modes.omega - 1, likeness.max(axis=1), loss)
+
+    def reduced(self, names: tuple[str, ...], T: NDArray[np.float64], matrices: tuple[NDArray[np.float64], NDArray[np.float64]],
+                history: Sequence[Step], method: str, notes: tuple[str, ...] = (), tolerance: float = 0.01,
+                least_mac: float = 0.95) -> Reduced:
+        """The reduced model, with a status and what it loses at the joints in words."""
+        last, joints = history[-1], self.structure.joints
+        status = "ok" if _met(last, tolerance, least_mac) else _missed(last, self.modes, tolerance, least_mac)
+        lost = ", ".join(f"{name} {100 * x:.2g} %" for name, x in zip(joints, last.joint_loss, strict=True))
+        said = (f"static flexibility of the joints lost by {method}: {lost}",) if joints else ()
+        return Reduced(self.structure, names, T, *matrices, tuple(history), float(np.linalg.cond(matrices[0])), method, self.rigid, status,
+                       (*notes, *said))
+
+
+SINGULAR = 1e12
+"""Condition number of a reduced mass matrix beyond which its coordinates count as dependent."""
+
+
+def _small_modes(T: NDArray[np.float64], M: NDArray[np.float64], K: NDArray[np.float64], count: int, rigid: int) -> Modes:
+    """Modes of a reduced model in the coordinates of the full one; dependent coordinates (SEREP) are freed of what they repeat."""
+    values, vectors = np.linalg.eigh(M)
+    if values[0] < values[-1] / SINGULAR:
+        kept = values > values[-1] / SINGULAR
+        basis = vectors[:, kept] / np.sqrt(values[kept])
+        T, M, K = T @ basis, np.eye(int(kept.sum())), project(K, basis)
+    small = eigenmodes(K, M, min(count, len(M)), rigid)
+    return Modes(T @ small.rigid, small.omega, T @ small.shapes)
 
 
 def _met(step: Step, tolerance: float, least_mac: float) -> bool:
