@@ -166,8 +166,11 @@ def begin_at(points):
     return first
 
 
-def test_two_modes_far_apart_are_flagged(monkeypatch):
-    """Modes so narrow and far apart that no walker finds the other: each ensemble looks settled, together they must not."""
+def test_two_modes_far_apart_are_flagged_or_joined(monkeypatch):
+    """Modes so narrow and far apart that no walker finds the other: each ensemble looks settled, together they must not.
+
+    A mixture learnt from all ensembles knows both, and gives each its half.
+    """
     from bayes_nlsid.inference import ensemble
     start = lend(1)
 
@@ -178,8 +181,11 @@ def test_two_modes_far_apart_are_flagged(monkeypatch):
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
     same = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
+    joined = settled(Written(start, two), start, ensembles=2, steps=600, most=1400)
+    monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
     apart = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
     assert same.status == "ok"
+    assert joined.convergence.converged and np.mean(joined.flat > 0) == pytest.approx(0.5, abs=0.05)
     assert apart.status == "not_converged" and any("disagree" in r for r in apart.reasons)
 
 
@@ -209,6 +215,9 @@ def test_stuck_walkers_are_redrawn_in_burn_in_and_counted(monkeypatch):
     points = 0.2 + 0.01 * np.random.default_rng(0).normal(size=(2, 20, 2))
     points[:, 0] = -0.9
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(points))
+    freed = settled(Written(start, trap), start, ensembles=2, steps=400)
+    assert freed.convergence.stuck_walkers == 0    # a proposal from the mixture frees it
+    monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
     found = settled(Written(start, trap), start, ensembles=2, steps=400)
     assert found.convergence.stuck_walkers == 2
     assert (found.flat > 0).all()

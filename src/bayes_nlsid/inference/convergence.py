@@ -19,6 +19,7 @@ RHAT, LENGTH, LEAST_ESS = 1.01, 50.0, 400.0    # limits: nested R-hat, chain len
 LEAST_ACCEPTANCE, STUCK_SHARE = 0.05, 0.10
 REDRAWN_SHARE = 0.5    # of walkers replaced before sampling began, which hints at poor starts but biases nothing that is kept
 CONTRACTION, NEAR, PILED = 0.2, 0.01, 0.10
+CONFLICT = 2.0         # prior standard deviations between prior mean and posterior median beyond which the two are said to disagree
 DECADE = 10.0          # ratio of 95 % to 5 % quantile beyond which a parameter is not called determined
 Array = NDArray[np.float64]
 
@@ -135,7 +136,7 @@ def stuck(log_prob: Array, acceptance: Array, dimensions: int) -> NDArray[np.boo
 
 
 def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str], nonlinear: Sequence[bool], prior_sd: Array, box: Array,
-           logarithmic: Sequence[bool] | None = None, redrawn: int = 0, stopped: str = "") -> Convergence:
+           prior_mean: Array | None = None, logarithmic: Sequence[bool] | None = None, redrawn: int = 0, stopped: str = "") -> Convergence:
     """Diagnostics of draws.
 
     Parameters
@@ -147,8 +148,8 @@ def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str]
     names : sequence of str, length P
     nonlinear : sequence of bool, length P
         Parameters of force laws; only these are judged by contraction, since a good modal test may say more than a recording.
-    prior_sd : ndarray (P,)
-        Standard deviation of the prior, in s.
+    prior_sd, prior_mean : ndarray (P,)
+        Standard deviation and mean of the prior, in s; without the mean nothing is said of a posterior that lies far from its prior.
     box : ndarray (2, P)
         Bounds in s.
     logarithmic : sequence of bool, length P
@@ -184,7 +185,7 @@ def assess(s: Array, log_prob: Array, acceptance: Array, *, names: Sequence[str]
     reasons += _convergence_reasons(names, n, tau, rhat, ess, acceptance, still, redrawn, m * w)
     converged = not reasons
     if converged:
-        reasons += _identification_reasons(draws, names, nonlinear, prior_sd, contraction, piled)
+        reasons += _identification_reasons(draws, names, nonlinear, prior_sd, contraction, piled, prior_mean)
         reasons += [f"{name} is known only to within a factor of {10**wide:.2g} between its 5 % and 95 % points"
                     for name, wide, flag in zip(names, spread, vague & (contraction >= CONTRACTION), strict=True) if flag]
     status = "not_converged" if not converged else "ok" if identifiable.all() else "not_identifiable"
@@ -222,7 +223,7 @@ def _convergence_reasons(names: Sequence[str], n: int, tau: Array, rhat: Array, 
 
 
 def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Sequence[bool], prior_sd: Array, contraction: Array,
-                            piled: Array) -> list[str]:
+                            piled: Array, prior_mean: Array | None = None) -> list[str]:
     """Parameters at their bounds, and directions in which the posterior is as wide as the prior, in words."""
     reasons = [f"{name} is at a bound of its range in {100 * share:.0f} % of the draws: a one-sided statement, or a bound to widen"
                for name, share in zip(names, piled, strict=True) if share > PILED]
@@ -243,7 +244,10 @@ def _identification_reasons(draws: Array, names: Sequence[str], nonlinear: Seque
             told |= set(shared)
     for i, k in enumerate(judged):
         if contraction[k] < CONTRACTION and i not in told:
-            reasons.append(f"{names[k]} is not informed: its posterior is as wide as its prior (contraction {contraction[k]:.2f})")
+            away = 0.0 if prior_mean is None else abs(float(np.median(draws[:, k])) - prior_mean[k]) / prior_sd[k]
+            reasons.append(f"{names[k]} is not informed: its posterior is as wide as its prior (contraction {contraction[k]:.2f})"
+                           if away < CONFLICT else f"{names[k]} lies {away:.1f} standard deviations of its prior away from it and is no "
+                           f"less uncertain: prior and recordings disagree, or the force law is not the right one")
     return reasons
 
 

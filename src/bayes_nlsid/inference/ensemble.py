@@ -2,7 +2,8 @@
 
 Moves: differential evolution 0.7, with full-length jumps between modes 0.1, snooker 0.2. They need three to four times fewer
 evaluations than the stretch move in 20 to 40 dimensions. The snooker move is our own: that of emcee 3.1.6 scales its step with the
-distance to the anchor without paying for it, and gives a Gaussian in five dimensions 0.7 of its variance.
+distance to the anchor without paying for it, and gives a Gaussian in five dimensions 0.7 of its variance. Once burn-in has shown the
+shape of the posterior, half of all proposals come from a mixture learnt from it (``mixture``).
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ from bayes_nlsid.inference.block import Block, Walkers
 from bayes_nlsid.inference.checkpoint import Checkpoints, identity
 from bayes_nlsid.inference.convergence import LENGTH, Convergence, assess, integrated_time, stuck
 from bayes_nlsid.inference.likelihood import Likelihood, WhittleLikelihood
+from bayes_nlsid.inference.mixture import Mixture, learn_mixture
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
 from bayes_nlsid.inference.starting import centres, first_walkers, starting_fits
 from bayes_nlsid.inference.target import Target
 
+FRESH = 0.5        # share of proposals from the mixture
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
 KEEP_FAILED = 20   # failed points remembered per block
 Array = NDArray[np.float64]
@@ -67,14 +70,37 @@ def _snooker_class() -> type:
     return Snooker
 
 
-def moves() -> list[tuple[Any, float]]:
+@cache
+def _fresh_class() -> type:
+    """The independence move as a move of emcee, made when emcee is first needed."""
+    from emcee.moves import RedBlueMove
+
+    @final
+    class Fresh(RedBlueMove):
+        """A new place drawn from a mixture that stands still, whatever the old one (Tierney 1994)."""
+
+        def __init__(self, mixture: Mixture) -> None:
+            super().__init__()
+            self.mixture = mixture
+
+        def get_proposal(self, s: Array, c: Sequence[Array], random: np.random.RandomState) -> tuple[Array, Array]:
+            """Proposals (n, P), and the log of the ratio of their densities g(s)/g(q)."""
+            proposal = self.mixture.sample(len(s), random)
+            return proposal, self.mixture.log_density(s) - self.mixture.log_density(proposal)
+
+    return Fresh
+
+
+def moves(mixture: Mixture | None = None) -> list[tuple[Any, float]]:
     """Moves and their shares."""
     from emcee.moves import DEMove
-    return [(DEMove(), 0.7), (DEMove(gamma0=1.0), 0.1), (_snooker_class()(), 0.2)]
+
+    local = [(DEMove(), 0.7), (DEMove(gamma0=1.0), 0.1), (_snooker_class()(), 0.2)]
+    return local if mixture is None else [*((move, share * (1 - FRESH)) for move, share in local), (_fresh_class()(mixture), FRESH)]
 
 
-def run_block(target: Target, start: Walkers, steps: int) -> Block:
-    """Advance one ensemble; the result depends on nothing but ``target`` and ``start``.
+def run_block(target: Target, start: Walkers, steps: int, mixture: Mixture | None = None) -> Block:
+    """Advance one ensemble; the result depends on nothing but the arguments.
 
     Parameters
     ----------
@@ -82,6 +108,8 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
     start : Walkers
         All of finite log density.
     steps : int
+    mixture : Mixture or None
+        From which half of the proposals are drawn.
 
     Returns
     -------
@@ -107,7 +135,7 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
         return value
 
     walkers, dimensions = start.s.shape
-    sampler = emcee.EnsembleSampler(walkers, dimensions, density, moves=moves(), vectorize=True)
+    sampler = emcee.EnsembleSampler(walkers, dimensions, density, moves=moves(mixture), vectorize=True)
     state = emcee.State(start.s, log_prob=start.log_prob, random_state=start.random)
     end = sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
     if interrupted[0]:
@@ -118,7 +146,7 @@ def run_block(target: Target, start: Walkers, steps: int) -> Block:
                  final_state, count[0], failed_at)
 
 
-def _advance(target: Target, task: tuple[Walkers, int]) -> Block:
+def _advance(target: Target, task: tuple[Walkers, int, Mixture | None]) -> Block:
     """The same as a task that can be given away."""
     return run_block(target, *task)
 
@@ -218,6 +246,7 @@ class _Run:
     stop: Callable[[], bool] | None
     blocks: list[list[Block]] = field(default_factory=list)     # by block, then ensemble
     burn_blocks: int | None = None
+    mixture: Mixture | None = None
     redrawn: int = 0
     stopped: str = ""
     next_check: int = 0
@@ -244,7 +273,7 @@ class _Run:
         number = len(self.blocks)
         done = {i: block for i in range(len(states)) if self.kept is not None and (block := self.kept.read(i, number)) is not None}
         todo = [i for i in range(len(states)) if i not in done]
-        for k, block in crew.run(_advance, [(states[i], self.block) for i in todo]):
+        for k, block in crew.run(_advance, [(states[i], self.block, self.mixture) for i in todo]):
             done[todo[k]] = block
             if self.kept is not None:
                 self.kept.write(todo[k], number, block)
@@ -267,7 +296,10 @@ class _Run:
         tau = max(integrated_time(half[..., i]) for i in range(half.shape[-1]))
         if (done >= LEAST_BURN and done >= BURN_TIMES * tau) or done + self.block > longest:
             self.burn_blocks = len(self.blocks)
-        elif done < BURN_TIMES * tau / 2:   # walkers that are still on their way down are not lost
+        if self.burn_blocks is not None or len(self.blocks).bit_count() == 1:
+            # after 1, 2, 4, … blocks, and at the end of burn-in for all that is kept
+            self.mixture = learn_mixture(half.reshape(-1, half.shape[-1]), self.prune_seed)
+        if self.burn_blocks is None and done < BURN_TIMES * tau / 2:   # walkers that are still on their way down are not lost
             return states
         last = self.blocks[-1]
         lost = stuck(np.array([b.log_prob for b in last]), np.array([b.accepted for b in last]) / self.block, half.shape[-1])
@@ -295,7 +327,7 @@ class _Run:
     def _assess(self, s: Array, value: Array, accepted: Array) -> Convergence:
         problem = self.target.problem
         return assess(s, value, accepted, names=problem.names, nonlinear=[p.param is not None for p in problem.model.parameters],
-                      prior_sd=self.target.prior_sd, box=self.target.box,
+                      prior_sd=self.target.prior_sd, prior_mean=self.target.prior_mean, box=self.target.box,
                       logarithmic=self.target.coordinates.logarithmic.tolist(), redrawn=self.redrawn, stopped=self.stopped)
 
     def _tell(self) -> None:

@@ -56,8 +56,16 @@ class Target:
     @property
     def prior_sd(self) -> NDArray[np.float64]:
         """Standard deviation (P,) of each prior in sampling coordinates, from its quantiles."""
+        return self._prior_quantiles().std(axis=0)
+
+    @property
+    def prior_mean(self) -> NDArray[np.float64]:
+        """Mean (P,) of each prior in sampling coordinates, from its quantiles."""
+        return self._prior_quantiles().mean(axis=0)
+
+    def _prior_quantiles(self) -> NDArray[np.float64]:
         shares = (np.arange(512) + 0.5) / 512
-        return self.to_s(np.stack([p.quantile(shares) for p in self.priors], axis=-1)).std(axis=0)
+        return self.to_s(np.stack([p.quantile(shares) for p in self.priors], axis=-1))
 
     def parts(self, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Log density (W,) of s (W, P), and where the likelihood failed although the prior allows the point."""
