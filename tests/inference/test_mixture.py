@@ -25,7 +25,7 @@ def test_density_is_that_of_t_distributions():
 
 
 def test_draws_follow_the_density():
-    s = two().sample(40_000, np.random.RandomState(1))
+    s = two().sample(40_000, np.random.default_rng(1))
     assert np.mean(s[:, 0] > 2) == pytest.approx(0.7, abs=0.02)
     first = stats.multivariate_t(two().means[0], two().roots[0] @ two().roots[0].T, df=FREEDOM)
     near = s[s[:, 0] < 1.5]
@@ -39,7 +39,7 @@ def test_a_curved_ridge_is_covered_and_a_normal_cloud_needs_one_piece():
     ridge = np.stack([x, x**2 + 0.02 * rng.normal(size=6000)], axis=1)
     found = learn_mixture(ridge, SEED)
     assert found is not None and len(found.weights) >= 8
-    off = np.abs(np.diff(found.sample(2000, np.random.RandomState(0))[:, [0, 1]] ** [2, 1], axis=1)[:, 0])
+    off = np.abs(np.diff(found.sample(2000, np.random.default_rng(0))[:, [0, 1]] ** [2, 1], axis=1)[:, 0])
     assert np.median(off) < 0.05    # one bell over the whole ridge is off by about one
     cloud = learn_mixture(rng.normal(size=(6000, 3)) @ np.array([[1e-3, 0, 0], [5.0, 1, 0], [2.0, 3.0, 1e4]]), SEED)
     assert cloud is not None and len(cloud.weights) == 1

@@ -258,9 +258,9 @@ def test_uninformed_and_tied_parameters_are_named():
 
 def test_a_posterior_far_from_its_prior_and_as_wide_is_a_disagreement():
     s = np.random.default_rng(0).normal(size=(4, 2000, 20, 1)) + 3.0
-    told = judge(s, prior_sd=np.ones(1), prior_mean=np.zeros(1)).reasons
+    told = judge(s, prior=1.0, prior_mean=np.zeros(1)).reasons
     assert len(told) == 1 and "3.0 standard deviations of its prior away" in told[0]
-    assert "not informed" in judge(s, prior_sd=np.ones(1), prior_mean=np.full(1, 2.0)).reasons[0]
+    assert "not informed" in judge(s, prior=1.0, prior_mean=np.full(1, 2.0)).reasons[0]
 
 
 def test_draws_at_a_bound_are_told():

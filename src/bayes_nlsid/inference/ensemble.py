@@ -85,7 +85,7 @@ def _fresh_class() -> type:
 
         def get_proposal(self, s: Array, c: Sequence[Array], random: np.random.RandomState) -> tuple[Array, Array]:
             """Proposals (n, P), and the log of the ratio of their densities g(s)/g(q)."""
-            proposal = self.mixture.sample(len(s), random)
+            proposal = self.mixture.sample(len(s), np.random.default_rng(random.randint(2**31, size=4)))
             return proposal, self.mixture.log_density(s) - self.mixture.log_density(proposal)
 
     return Fresh

@@ -58,11 +58,11 @@ class Mixture:
 
     @cached_property
     def _whitening(self) -> Array:
-        return np.linalg.inv(self.roots)
+        return np.asarray(np.linalg.inv(self.roots), dtype=float)
 
     @cached_property
     def _level(self) -> Array:
-        return np.log(self.weights) - np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
+        return np.asarray(np.log(self.weights) - np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1))
 
     def log_density(self, s: Array) -> Array:
         """(n,) of s (n, P), up to a constant."""
@@ -71,11 +71,11 @@ class Mixture:
         each = self._level - 0.5 * (FREEDOM + size) * np.log1p(np.sum(z**2, axis=-1) / FREEDOM)
         return np.asarray(np.logaddexp.reduce(each, axis=1))
 
-    def sample(self, count: int, random: np.random.RandomState) -> Array:
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent draws (count, P)."""
-        which = random.choice(len(self.weights), size=count, p=self.weights)
-        tail = np.sqrt(random.chisquare(FREEDOM, size=count) / FREEDOM)
-        z = random.normal(size=(count, self.means.shape[1])) / tail[:, None]
+        which = rng.choice(len(self.weights), size=count, p=self.weights)
+        tail = np.sqrt(rng.chisquare(FREEDOM, size=count) / FREEDOM)
+        z = rng.normal(size=(count, self.means.shape[1])) / tail[:, None]
         return np.asarray(self.means[which] + np.einsum("nij,nj->ni", self.roots[which], z))
 
 
