@@ -13,14 +13,18 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import Campaign, Trial
 from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
+from bayes_nlsid.mismatch.innovations import Bench
 from bayes_nlsid.mismatch.odds import LAYER, Key, OddsLayer, rises
-from bayes_nlsid.mismatch.weigh import Weighed
+from bayes_nlsid.mismatch.settled import settled
+from bayes_nlsid.mismatch.weigh import Weighed, searched
 
 Array = NDArray[np.float64]
-RIVALS = 3      # hypotheses of different classes that are estimated jointly
+ITERATIONS = 12
+LAWS = 3        # of one class that are tried
+CHARGE = 0.01   # of the logarithm of squared error, for each parameter of a law
+RIVALS = 5      # hypotheses of different classes that are estimated jointly
 BLOCKS = 24
 LOUD = 3.0      # error of the best linear model over noise from which rivals are simulated whatever the bench says
 
@@ -70,30 +74,80 @@ def errors_by_block(trials: Sequence[Trial], waves: Sequence[Array], first: Sequ
     return np.array(out)
 
 
-def enter(campaign: Campaign, linear: Linear, drive: Drive, weighed: Weighed | None) -> Entrant:
-    """Estimate one hypothesis (None: the linear model) by simulation."""
-    channels = len(campaign.used("fit")[0].recording.channels)
+def enter(campaign: Campaign, bench: Bench, weighed: Weighed | None) -> Entrant:
+    """Estimate one hypothesis (None: the linear model) by simulation, from where it settles on the bench."""
+    linear, drive = bench.linear, bench.drive
     suspects, factors = ((), ()) if weighed is None else (weighed.suspects, weighed.factors)
-    model, waves = estimate(linear, drive, campaign, extended(linear, suspects, factors, channels))
+    model = extended(linear, suspects, factors, len(campaign.used("fit")[0].recording.channels), push=_push(campaign))
+    starts = settled(campaign, linear, drive, bench, model) if suspects else []
+    model, waves = estimate(linear, drive, campaign, model, ITERATIONS, starts)
     trials = simulated(campaign)
     blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
     return Entrant(weighed, model, tuple(waves), blocks)
 
 
-def polished(campaign: Campaign, linear: Linear, drive: Drive, entrant: Entrant, iterations: int = 24) -> Entrant:
+def _push(campaign: Campaign) -> float:
+    """rms of the strongest force, N; 1 where none was measured."""
+    sizes = [float(np.std(t.recording.force)) for t in campaign.used("fit") if t.recording.force.size]
+    return max(sizes, default=0.0) or 1.0
+
+
+def polished(campaign: Campaign, bench: Bench, entrant: Entrant, iterations: int = 24) -> Entrant:
     """The same entrant estimated to the end, if it stopped at its limit of iterations."""
     if entrant.failed or entrant.model.status != "iteration limit":
         return entrant
-    model, waves = estimate(linear, drive, campaign, entrant.model, iterations)
+    model, waves = estimate(bench.linear, bench.drive, campaign, entrant.model, iterations)
     trials = simulated(campaign)
     blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
     better = np.isfinite(blocks).all() and blocks.mean() < entrant.blocks.mean() + 0.01
     return Entrant(entrant.weighed, model, tuple(waves), blocks) if better else entrant
 
 
-def hold(campaign: Campaign, linear: Linear, drive: Drive, tuned: Entrant, singles: Sequence[Weighed], pairs: Sequence[Weighed],
+def champion(campaign: Campaign, bench: Bench, tuned: Entrant, weighed: Weighed) -> Entrant:
+    """The hypothesis by the law of its class that simulates best; a richer law than another must be clearly better.
+
+    A richer law always fits as well as a simpler one on the bench, and is the harder to estimate by simulation.
+    """
+    level = np.inf if tuned.failed else float(tuned.blocks.mean())
+    kept: Entrant | None = None
+    for w in sorted((weighed, *weighed.others[:LAWS - 1]), key=lambda w: (_shapes(w), -w.gain)):
+        tried = enter(campaign, bench, w)
+        if tried.failed or float(tried.blocks.mean()) < level:
+            tried = polished(campaign, bench, tried)
+        if kept is None or kept.weighed is None or kept.failed or (not tried.failed and richer(kept, tried)):
+            kept = tried
+    assert kept is not None
+    return kept
+
+
+def _shapes(w: Weighed) -> int:
+    """Number of parameters that give the laws of a hypothesis their shape."""
+    return sum(searched(s) for s in w.suspects)
+
+
+def richer(simple: Entrant, rich: Entrant) -> bool:
+    """Whether the law with more parameters is clearly better in simulation, by two standard errors over blocks and some per cent for
+    each parameter."""
+    assert simple.weighed is not None and rich.weighed is not None
+    difference = simple.blocks - rich.blocks
+    error = float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
+    return float(difference.mean()) > 2 * error + CHARGE * (_shapes(rich.weighed) - _shapes(simple.weighed))
+
+
+def ahead(before: Array, after: Array) -> float:
+    """How far the second model leads the first: mean decrease of the logarithmic block errors over its error; from 1 on by some per cent
+    at least."""
+    difference = before - after
+    error = float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
+    return float(difference.mean()) / (0.1 + error)
+
+
+def hold(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequence[Weighed], pairs: Sequence[Weighed],
          odds: dict[Key, float], say: Callable[[float, str], None]) -> list[Entrant]:
-    """Estimate the likeliest hypothesis of some classes: those with odds; all, where the linear model leaves far more than noise."""
+    """Estimate the likeliest hypothesis of some classes: those with odds; all, where the linear model leaves far more than noise.
+
+    A pair comes with the better of its members, which it must beat.
+    """
     trials = simulated(campaign)
     floor = np.mean([np.log(np.mean(t.noise ** 2 / (np.mean(t.recording.response ** 2, axis=0) + t.noise ** 2 + 1e-300)) + 1e-12)
                      for t in trials])
@@ -102,13 +156,39 @@ def hold(campaign: Campaign, linear: Linear, drive: Drive, tuned: Entrant, singl
                     key=lambda w: -odds.get(w.key, 0.0))
     chosen: list[Weighed] = []
     for w in ranked:
-        if all({c for c, _ in w.key} != {c for c, _ in other.key} for other in chosen):
+        if len(chosen) < RIVALS and all(classes(w) != classes(other) for other in chosen):
             chosen.append(w)
+    for w in [w for w in chosen if len(w.key) > 1]:
+        members = [m for m in singles if m.key[0] in w.key and modelled(m)]
+        if members and all(m.key != members[0].key for m in chosen):
+            chosen.append(members[0])
     out = []
-    for i, w in enumerate(chosen[:RIVALS]):
-        say(0.55 + 0.1 * i, "estimating " + " and ".join(f"{c} at {p}" for c, p in w.key))
-        out.append(enter(campaign, linear, drive, w))
+    for i, w in enumerate(chosen):
+        say(0.55 + 0.3 * i / len(chosen), "estimating " + " and ".join(f"{c} at {p}" for c, p in w.key))
+        out.append(champion(campaign, bench, tuned, w))
     return out
+
+
+def classes(w: Weighed) -> frozenset[str]:
+    """Classes of a hypothesis."""
+    return frozenset(c for c, _ in w.key)
+
+
+def second(entrants: Sequence[Entrant]) -> float:
+    """Factor on the odds of two effects against one: what a pair must show in simulation beside the better of its members.
+
+    1 where no pair was simulated beside a member.
+    """
+    worth = []
+    for e in entrants:
+        assert e.weighed is not None
+        if len(e.weighed.key) > 1:
+            members = [m for m in entrants if m.weighed is not None and len(m.weighed.key) == 1 and m.weighed.key[0] in e.weighed.key]
+            alone = [m for m in members if not m.failed]
+            if alone:
+                best = min(alone, key=lambda m: float(m.blocks.mean()))
+                worth.append(0.02 if e.failed else rises(max(ahead(best.blocks, e.blocks), 1e-3), 1.5, 3.0))
+    return max(worth, default=1.0)
 
 
 def modelled(w: Weighed) -> bool:

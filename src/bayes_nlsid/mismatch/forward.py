@@ -7,7 +7,7 @@ every transient are moved together by damped Gauss–Newton on the simulated cha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, final
 
@@ -32,6 +32,8 @@ START_CYCLES = 6     # of the slowest mode, from which an unknown start is estim
 AT_REST = 0.03
 SAMPLES = 12_000     # of all records that a re-estimation simulates
 SHIFT = 1e-5
+FREQUENCIES = (0.6, 1.5)   # of the linear part beside a law, over those of the best linear model
+DAMPING = (0.03, 30.0)
 CLOSE = 4e-3         # error of the integrator, relative, that is accepted here
 OFFSET = Term("constant", "f", (Param("f", "N", "coefficient", meaning="constant force"),), partial(laws.displacement_even, power=0.0),
               partial(laws.displacement_even_slope, power=0.0), parity="even",
@@ -60,6 +62,8 @@ class Extended:
     status : str
     suspects : tuple of Suspect
         Effects beside the linear model.
+    low, high : ndarray (P,)
+        Between which each parameter must stay.
     """
 
     model: Model
@@ -70,15 +74,13 @@ class Extended:
     covariance: Array
     status: str = "ok"
     suspects: tuple[Suspect, ...] = ()
+    low: Array = field(default_factory=lambda: np.array(-np.inf))
+    high: Array = field(default_factory=lambda: np.array(np.inf))
 
     def at(self, x: Array) -> Array:
         """Theta (K, P) for moves x (K, P) from here, clipped to what the laws admit."""
         out = np.where([k == "log" for k in self.kind], self.theta * np.exp(np.clip(x, -20, 20)), self.theta + x * self.unit)
-        out = np.where([k == "held" for k in self.kind], self.theta, out)
-        for i, p in enumerate(self.model.parameters):
-            if p.param is not None and p.param.rule == "range" and self.kind[i] != "held":
-                out[..., i] = np.clip(out[..., i], p.param.lower, p.param.upper)
-        return np.asarray(out)
+        return np.where([k == "held" for k in self.kind], self.theta, np.clip(out, self.low, self.high))
 
     def draws(self, count: int, seed: int) -> Array:
         """Parameters (count, P) from the normal approximation."""
@@ -86,14 +88,16 @@ class Extended:
         return self.at(np.random.default_rng(seed).standard_normal((count, len(self.theta))) @ root.T)
 
 
-def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[float], channels: int, freed: bool = True) -> Extended:
-    """The linear model with the laws of the suspects; ``freed``: whether its linear parameters may move."""
+def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[float], channels: int, freed: bool = True,
+             push: float = 1.0) -> Extended:
+    """The linear model with the laws of the suspects; ``freed``: whether its linear parameters may move; ``push``: size of the forces."""
     base = replace(linear.model, omega=linear.modal.omega, zeta=linear.modal.zeta)
     forced = bool(base.inputs)
     elements: list[Element] = [Element(OFFSET, (base.inputs[0],), excess=False)] if forced else []
     values: list[float] = [-float(linear.offsets[0])] if forced else []
     kinds: list[str] = ["linear"] if forced else []
     units: list[float] = [1.0] if forced else []
+    edges: list[tuple[float, float]] = []
     for suspect, factor in zip(suspects, factors, strict=True):
         law = suspect.law
         assert law is not None
@@ -101,9 +105,10 @@ def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[floa
         names = [q.name for q in law.term.params]
         held = tuple((n, float(v)) for n, v, k in zip(names, p, law.free, strict=True) if k == "fixed")
         elements.append(Element(law.term, (suspect.place,), excess=law.excess, fixed=held))
-        for value, kind, q in zip(p, law.free, law.term.params, strict=True):
+        for value, kind, q, low, high in zip(p, law.free, law.term.params, *suspect.bounds, strict=True):
             if kind == "fixed":
                 continue
+            edges.append((float(low), float(high)))
             values.append(float(value))
             kinds.append("log" if kind == "log" and value > 0 else "linear")
             size = suspect.size
@@ -112,13 +117,20 @@ def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[floa
     rigid = base.omega < RIGID
     move = "log" if freed else "held"
     moves = [*("held" if r else move for r in rigid), *[move] * base.modes, *([move] if forced else []), *kinds]
-    if not freed and forced:
+    if forced and not (freed and (suspects or rigid.any())):
+        # a constant force on a linear spring is a constant of the channel
         moves[2 * base.modes + 1] = "held"
     theta = np.concatenate([base.omega / (2 * np.pi), base.zeta, [linear.gain] if forced else [], values])
     unit = np.concatenate([np.ones(2 * base.modes + (1 if forced else 0)), units])
     if forced:
-        unit[2 * base.modes + 1] = 1.0
-    return Extended(model, theta, tuple(moves), unit, np.zeros(channels), np.zeros((len(theta), len(theta))), suspects=tuple(suspects))
+        unit[2 * base.modes + 1] = max(push, 1e-300)
+    limits = np.array([(-np.inf, np.inf)] * (len(theta) - len(edges)) + edges)
+    if not rigid.any() and freed:
+        # a law must not take the place of the linear spring
+        limits[:base.modes] = theta[:base.modes, None] * np.array(FREQUENCIES)
+        limits[base.modes:2 * base.modes] = theta[base.modes:2 * base.modes, None] * np.array(DAMPING)
+    return Extended(model, theta, tuple(moves), unit, np.zeros(channels), np.zeros((len(theta), len(theta))), suspects=tuple(suspects),
+                    low=limits[:, 0], high=limits[:, 1])
 
 
 @final
@@ -194,8 +206,17 @@ def simulate_task(ext: Extended, task: Task, theta: Array, starts: Array) -> Arr
     return values
 
 
-def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, iterations: int = 8) -> tuple[Extended, list[Array]]:
+def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, iterations: int = 8, starts: Sequence[Array] = ()
+             ) -> tuple[Extended, list[Array]]:
     """Least squares on the simulated channels of all fitted records.
+
+    Parameters
+    ----------
+    linear, drive, campaign
+    ext : Extended
+    iterations : int
+    starts : sequence of ndarray (P,)
+        Other parameters to start from; the one whose simulation is closest is taken.
 
     Returns
     -------
@@ -210,6 +231,7 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
         tasks = [task_of(linear, drive, t, ext, most) for t in trials]
     except (ValueError, np.linalg.LinAlgError) as error:
         return replace(ext, status=f"not simulated: {error}"), []
+    ext = _closest(ext, tasks, starts)
     moving = np.array([k != "held" for k in ext.kind])
     sizes = [t.unknown for t in tasks]
     P = int(moving.sum())
@@ -237,6 +259,23 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
     covariance = np.zeros_like(ext.covariance)
     covariance[np.ix_(moving, moving)] = _covariance(slope, residual, P)
     return replace(ext, theta=theta, offset=offset, covariance=covariance, status=status), [w[0] + offset for w in waves]
+
+
+def _closest(ext: Extended, tasks: Sequence[Task], starts: Sequence[Array]) -> Extended:
+    """The extended model at its own parameters or at those of the starts, whichever simulates the records most closely."""
+    if not starts:
+        return ext
+    thetas = np.array([ext.theta, *starts])
+    cost = np.zeros(len(thetas))
+    for t in tasks:
+        difference = simulate_task(ext, t, thetas, np.zeros((len(thetas), t.unknown))) - t.recording.response
+        with np.errstate(invalid="ignore", over="ignore"):
+            difference = (difference - _constant(difference, t.weight)) * t.weight
+            cost += (difference ** 2).sum(axis=(1, 2))
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    # the last start is the most settled one: taken where no simulation can be trusted
+    best = int(np.argmin(cost)) if np.isfinite(cost).any() else len(thetas) - 1
+    return replace(ext, theta=thetas[best])
 
 
 def simulated(campaign: Campaign) -> tuple[Trial, ...]:

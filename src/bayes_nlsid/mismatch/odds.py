@@ -88,7 +88,8 @@ def two(singles: Sequence[Weighed], pairs: Sequence[Weighed], layer: OddsLayer =
 
 
 def odds_of(singles: Sequence[Weighed], pairs: Sequence[Weighed], values: float, unexplained: float = 0.0,
-            proof: float = 0.0, tilt: Mapping[Key, float] | None = None, layer: OddsLayer = LAYER) -> dict[Key, float]:
+            proof: float = 0.0, tilt: Mapping[Key, float] | None = None, second: float = 1.0, layer: OddsLayer = LAYER
+            ) -> dict[Key, float]:
     """Probability of every hypothesis, of none (empty key) and of something outside the catalogue; they sum to one.
 
     Parameters
@@ -102,11 +103,13 @@ def odds_of(singles: Sequence[Weighed], pairs: Sequence[Weighed], values: float,
         Probability that something is missing from what simulation of whole records shows.
     tilt : mapping or None
         Factors on the odds of hypotheses that were simulated.
+    second : float
+        Factor on the probability of two effects, from simulation.
     """
     leaders = [w for group in (pairs[:1], singles[:1]) for w in group]
     best = max(leaders, key=lambda w: w.gain) if leaders else None
     missing = 1 - (1 - something(best, values, layer)) * (1 - min(proof, 0.9995))
-    double = two(singles, pairs, layer)
+    double = second * two(singles, pairs, layer)
     weights: dict[Key, float] = {}
     for group, share in ((singles, 1 - double), (pairs, double)):
         raw = {key: value * (tilt or {}).get(key, 1.0) for key, value in _raw(group, layer).items()}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.contest import Entrant, enter, errors_by_block, hold, polished, proof, tilts, unexplained_error
+from bayes_nlsid.mismatch.contest import Entrant, enter, errors_by_block, hold, polished, proof, second, tilts, unexplained_error
 from bayes_nlsid.mismatch.forward import Extended, extended, predict, simulated
 from bayes_nlsid.mismatch.innovations import Bench, lay_out
 from bayes_nlsid.mismatch.observer import Modal
@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 RETUNINGS = 3
 WORSE = 1.02
+WITHDRAWN = 0.1   # factor on the odds of what made records that were not used worse
 
 
 def silent(share: float, sentence: str) -> None:
@@ -134,27 +135,32 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     odds = odds_of(singles, pairs, values)
     say(0.5, "re-tuning the linear model by forward simulation")
     channels = len(campaign.used("fit")[0].recording.channels)
-    linear_one = polished(campaign, linear, drive, enter(campaign, linear, drive, None))
-    rivals = hold(campaign, linear, drive, linear_one, singles, pairs, odds, say)
-    tilt = tilts(rivals)
-    leader = polished(campaign, linear, drive, _leader(linear_one, rivals, odds, tilt))
-    tuned, best, named = linear_one.model, leader.model, leader.weighed
+    linear_one = polished(campaign, bench, enter(campaign, bench, None))
+    rivals = hold(campaign, bench, linear_one, singles, pairs, odds, say)
+    tilt, more = tilts(rivals), second(rivals)
+    tuned = linear_one.model
     nominal = extended(start_of(campaign, nominal=True), (), (), channels, freed=False)
     say(0.85, "simulating records that were not used")
-    shown = {t.name: (_shown(start_of(campaign, nominal=True), drive, nominal, t), _shown(linear, drive, tuned, t),
-                      _shown(linear, drive, best, t)) for t in campaign.used("judge")}
-    bands = (_bands(campaign, linear_one.waves), _bands(campaign, leader.waves))
-    scores = score_all(campaign, shown, bands)
-    sure = _proved(campaign, shown) if named is not None else 0.0
-    withdrawn = named is not None and scores.get("extended", np.inf) > WORSE * scores.get("updated", np.inf)
-    if withdrawn:
-        notes += ("The named effect made the records that were not used worse and was withdrawn from the predictions.",)
-        best, named, shown, sure = tuned, None, {n: (s[0], s[1], s[1]) for n, s in shown.items()}, 0.0
-        bands = (bands[0], bands[0])
+    plain = {t.name: (_shown(start_of(campaign, nominal=True), drive, nominal, t), _shown(linear, drive, tuned, t))
+             for t in campaign.used("judge")}
+    leader, shown, bands, scores, failed = linear_one, _with(plain, None), (_bands(campaign, linear_one.waves),) * 2, {}, []
+    for rival in (*_standing(linear_one, rivals, odds_of(singles, pairs, values, tilt=tilt, second=more)), linear_one):
+        leader = polished(campaign, bench, rival)
+        shown = _with(plain, {t.name: _shown(linear, drive, leader.model, t) for t in campaign.used("judge")} if leader.weighed else None)
+        bands = (_bands(campaign, linear_one.waves), _bands(campaign, leader.waves))
         scores = score_all(campaign, shown, bands)
+        if leader.weighed is None or not scores["extended"] > WORSE * scores["updated"]:
+            break
+        failed.append(leader.weighed.key)
+    best, named = leader.model, leader.weighed
+    sure = _proved(campaign, shown) if named is not None else 0.0
+    withdrawn = named is None and bool(failed)
+    notes += tuple(f"With {' and '.join(f'{c} at {p}' for c, p in key)} the records that were not used are simulated worse than with the "
+                   "re-tuned linear model; it was withdrawn." for key in failed)
+    tilt = {k: v * (WITHDRAWN if k in failed else 1.0) for k, v in tilt.items()}
     notes += tuple(f"Record {n} is simulated worse with what was found than without it, though all together are simulated better."
                    for n in worse(campaign, shown))
-    odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0, sure, tilt)
+    odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0, sure, tilt, more)
     odds = _outside(odds, scores)
     if withdrawn:
         odds = {k: (v * 0.5 if k else 0.5 + 0.5 * v) for k, v in odds.items()}
@@ -176,12 +182,16 @@ def _one_linear_reading(campaign: Campaign, singles: list[Weighed], pairs: list[
     return [w for w in singles if fine(w)], [w for w in pairs if fine(w)], ()
 
 
-def _leader(tuned: Entrant, rivals: Sequence[Entrant], odds: dict[Key, float], tilt: dict[Key, float]) -> Entrant:
-    """The likeliest rival that simulates the fitted records better than the linear model does; the linear model if there is none."""
+def _standing(tuned: Entrant, rivals: Sequence[Entrant], odds: dict[Key, float]) -> list[Entrant]:
+    """Rivals that simulate the fitted records better than the linear model does, likeliest first."""
     level = float(tuned.blocks.mean()) if not tuned.failed else np.inf
-    able = [(odds.get(r.weighed.key, 0.0) * tilt.get(r.weighed.key, 1.0), i) for i, r in enumerate(rivals)
-            if r.weighed is not None and not r.failed and float(r.blocks.mean()) < level]
-    return rivals[max(able)[1]] if able else tuned
+    able = [r for r in rivals if r.weighed is not None and not r.failed and float(r.blocks.mean()) < level]
+    return sorted(able, key=lambda r: -odds.get(r.weighed.key if r.weighed is not None else (), 0.0))
+
+
+def _with(plain: dict[str, tuple[Shown, Shown]], extended: dict[str, Shown] | None) -> dict[str, tuple[Shown, Shown, Shown]]:
+    """Nominal, re-tuned and extended; without an extension the re-tuned model stands in its place."""
+    return {name: (a, b, b if extended is None else extended[name]) for name, (a, b) in plain.items()}
 
 
 def _proved(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> float:

@@ -26,6 +26,8 @@ FINER = 4   # force laws are evaluated so many times finer than the records: wha
 BOUC_WEN = Law(LIBRARY["bouc_wen"], lambda z: np.array([[1.0, b / z.displacement, 1.0, d, 1.0] for b in (0.3, 1.0, 3.0)
                                                         for d in (-1.6, -1.2, -0.5, 0.5)]),
                ("log", "log", "fixed", "linear", "fixed"), (0,), excess=True)
+# Largest gap over the largest motion, and largest rounding of its faces: beyond them the law is a smooth hardening spring.
+GAPS = {("clearance", "d"): 1.8, ("rounded_gap", "e"): 0.9, ("rounded_gap", "w"): 0.2, ("one_stop", "e"): 0.9, ("two_stops", "e"): 0.9}
 FORCES = ("hardening", "softening", "clearance", "asymmetric", "coulomb", "quad_damping", "hysteresis")
 
 
@@ -55,6 +57,21 @@ class Suspect:
     def key(self) -> tuple[str, str]:
         """Class and place."""
         return self.cls, self.place
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest value (n_p,) of each parameter; a gap must be closed by the motion, and open where it is said to be."""
+        if self.law is None:
+            return np.zeros(0), np.zeros(0)
+        params = self.law.term.params
+        low = np.array([p.lower if p.rule == "range" else -np.inf for p in params])
+        high = np.array([p.upper if p.rule == "range" else np.inf for p in params])
+        if self.size is not None:
+            for i, p in enumerate(params):
+                reach = GAPS.get((self.law.term.name, p.name))
+                if reach is not None:
+                    high[i] = min(high[i], reach * (self.size.peak if p.unit == "m" else 1.0))
+        return low, high
 
     def parameters(self, factor: float) -> Array:
         """Parameters of the law when its force is scaled by ``factor``."""
@@ -120,7 +137,8 @@ def response(bench: Bench, place: Place, law: Law, shapes: Array) -> Array:
     """Whitened innovations (K, N) of a law with K shapes; rows of laws that are not finite along the motion are zero."""
     parts = []
     for desk, motion in zip(bench.desks, place.motions, strict=True):
-        g = force_along(law.term, motion, shapes, law.excess)
+        with np.errstate(all="ignore"):
+            g = force_along(law.term, motion, shapes, law.excess)
         g = np.where(np.isfinite(g).all(axis=1, keepdims=True), g, 0.0)
         # a law acts against the motion
         parts.append(desk.to_force(-place.row, g, FINER))
@@ -142,6 +160,10 @@ def force_suspects(bench: Bench, places: Sequence[Place], classes: Sequence[str]
                 continue
             for law in laws_of(cls):
                 shapes = law.shapes(place.size)
+                low, high = Suspect(cls, place.name, law, shapes[0], place.size).bounds
+                shapes = shapes[((shapes >= low) & (shapes <= high)).all(axis=1)]
+                if not len(shapes):
+                    continue   # no gap that this motion closes
                 yield place, cls, law, shapes, response(bench, place, law, shapes)
         if progress is not None:
             progress((i + 1) / len(places))

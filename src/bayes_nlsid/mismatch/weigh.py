@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 REFINED = 6        # suspects whose shape is refined
 SHAPE_CHARGE = 3.0   # nats for each shape parameter that was searched
 PLACES_KEPT = 6
+OF_THE_BEST = 0.5    # gain of another law of the same class over the best, from which it is kept beside it
 
 
 @final
@@ -51,6 +52,8 @@ class Weighed:
         Nats for what was searched.
     share : float
         Share of the projected squared innovations that it explains.
+    others : tuple of Weighed
+        The same class at the same place by other force laws, best first.
     """
 
     suspects: tuple[Suspect, ...]
@@ -59,6 +62,7 @@ class Weighed:
     column: Array
     charge: float
     share: float
+    others: tuple[Weighed, ...] = ()
 
     @property
     def key(self) -> tuple[tuple[str, str], ...]:
@@ -149,15 +153,19 @@ def weigh(scale: Scale, progress: Callable[[float], None] | None = None, refine:
     """Every suspect that these recordings can test, best first; the best of each class and place only."""
     e = scale.residual
     best: dict[tuple[str, str], Weighed] = {}
+    tried: dict[tuple[str, str], list[Weighed]] = {}
     for place, cls, law, shapes, x in force_suspects(scale.bench, scale.places, scale.classes, progress):
         prepared, able = distinct(scale, x)
         blocks, factors, shares = score(scale.bench, e, prepared, law.signed)
         gains = np.where(np.isfinite(blocks).all(axis=1) & able, blocks.sum(axis=1), -np.inf)
         i = int(np.argmax(gains))
-        if np.isfinite(gains[i]) and ((cls, place.name) not in best or gains[i] > best[cls, place.name].blocks.sum()):
+        if np.isfinite(gains[i]):
             suspect = Suspect(cls, place.name, law, shapes[i], place.size)
-            best[cls, place.name] = Weighed((suspect,), (float(factors[i]),), blocks[i], prepared[i],
-                                            SHAPE_CHARGE * _searched(suspect), float(shares[i]))
+            tried.setdefault((cls, place.name), []).append(Weighed((suspect,), (float(factors[i]),), blocks[i], prepared[i],
+                                                                   SHAPE_CHARGE * searched(suspect), float(shares[i])))
+    for key, some in tried.items():
+        ordered = sorted(some, key=lambda w: -w.gain)
+        best[key] = replace(ordered[0], others=tuple(w for w in ordered[1:] if w.gain > OF_THE_BEST * ordered[0].gain > 0))
     for w in _others(scale, e):
         best[w.suspects[0].key] = w
     ranked = sorted((w for w in best.values() if np.isfinite(w.gain)), key=lambda w: -w.gain)
@@ -179,7 +187,8 @@ def distinct(scale: Scale, x: Array) -> tuple[Array, NDArray[np.bool_]]:
     return prepared * np.where(able, size, 0.0)[:, None], able
 
 
-def _searched(suspect: Suspect) -> int:
+def searched(suspect: Suspect) -> int:
+    """Number of shape parameters that were searched."""
     law = suspect.law
     return 0 if law is None else sum(kind != "fixed" for i, kind in enumerate(law.free) if i not in law.scaled)
 
@@ -205,15 +214,13 @@ def refined(scale: Scale, e: Array, found: Weighed) -> Weighed:
     moving = [i for i in moving if not (law.excess and law.term.name != "bouc_wen" and i == 1)]
     if not moving:
         return found
-    low, high = (np.array([getattr(p, side) for p in law.term.params]) for side in ("lower", "upper"))
+    low, high = suspect.bounds
 
     def shape_at(x: Array) -> Array:
         out = suspect.shape.copy()
         for value, i in zip(x, moving, strict=True):
             out[i] = suspect.shape[i] * np.exp(value) if law.free[i] == "log" else suspect.shape[i] + value * _step(suspect, i)
-            if law.term.params[i].rule == "range":
-                out[i] = np.clip(out[i], low[i], high[i])
-        return out
+        return np.clip(out, low, high)
 
     def explained(x: Array) -> float:
         column, able = distinct(scale, response(scale.bench, place, law, shape_at(x)[None]))
