@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.campaign import Trial
 from bayes_nlsid.mismatch.observer import ORDER, Modal, Observer, observe
+from bayes_nlsid.mismatch.seen import Seen, fed, key_of
+from bayes_nlsid.recordings.recording import Channel, Recording
 from bayes_nlsid.structure.modal import ModalModel
 
 Array = NDArray[np.float64]
@@ -32,12 +34,27 @@ class Linear:
         Factor on measured forces.
     offsets : ndarray (k,)
         Constant added to each measured force, N.
+    seen : Seen or None
+        Corrections of the channels: errors of the mode shapes there, force that is fed through.
     """
 
     model: ModalModel
     modal: Modal
     gain: float
     offsets: Array
+    seen: Seen | None = None
+
+    def rows(self, channels: Sequence[Channel]) -> Array:
+        """Rows (s, m) of channels, corrected."""
+        rows = self.model.rows([c.location for c in channels])
+        return rows if self.seen is None else rows + self.seen.shapes[[self.seen.keys.index(key_of(c)) for c in channels]]
+
+    def response(self, record: Recording) -> Array:
+        """Channels (n, s) of a record without the force that is fed through."""
+        if self.seen is None or record.free:
+            return record.response
+        at = [self.seen.keys.index(key_of(c)) for c in record.channels]
+        return np.asarray(record.response - fed(self.model, record) @ self.seen.direct[at].T)
 
     def forces(self, trial: Trial) -> Array:
         """Known modal force (n, m) of a record."""
@@ -65,7 +82,7 @@ class Drive:
 def observer_of(linear: Linear, trial: Trial, drive: Drive) -> Observer:
     """The steady filter of one record."""
     record = trial.recording
-    rows = linear.model.rows([c.location for c in record.channels])
+    rows = linear.rows(record.channels)
     size = np.std(record.response, axis=0)
     noise = np.maximum(trial.noise * drive.noise, 1e-6 * np.maximum(size, 1e-12 * size.max() + 1e-300))
     return Observer(linear.modal, record.dt, rows, tuple(ORDER[c.quantity] for c in record.channels), noise ** 2, drive.force)
@@ -84,11 +101,12 @@ def best_drive(linear: Linear, trials: Sequence[Trial], forces: Sequence[Array])
     share = np.ones(linear.model.modes) * _modal_scale(linear, short) ** 2
     best, likelihood, latent = Drive(share * DRIVES[3], 1.0), -np.inf, np.zeros((1, linear.model.modes))
     for _ in range(2):
-        for noise in NOISES:
+        # the low-pass leaves less noise near the end of the band than a measured floor says, which likelihood would take for no noise
+        for noise in NOISES if trial.bound else NOISES[:2]:
             for factor in DRIVES:
                 drive = Drive(share * factor, noise)
                 try:
-                    found = observe(observer_of(linear, short, drive), short.recording.response, force)
+                    found = observe(observer_of(linear, short, drive), linear.response(short.recording), force)
                 except (np.linalg.LinAlgError, ValueError):
                     continue
                 if np.isfinite(found.likelihood) and found.likelihood > likelihood:
@@ -104,7 +122,7 @@ def best_drive(linear: Linear, trials: Sequence[Trial], forces: Sequence[Array])
 def _modal_scale(linear: Linear, trial: Trial) -> float:
     """Size of the modal acceleration, from the loudest channel."""
     record = trial.recording
-    rows = np.abs(linear.model.rows([c.location for c in record.channels])).max(axis=1)
+    rows = np.abs(linear.rows(record.channels)).max(axis=1)
     elastic = linear.modal.omega[linear.modal.omega > 1e-3]
     w = float(elastic[0]) if elastic.size else 2 * np.pi * 4 / (record.n * record.dt)
     order = np.array([ORDER[c.quantity] for c in record.channels])

@@ -23,6 +23,7 @@ Use = Literal["fit", "judge", "sealed", "noise"]
 RIGID = 1e-3
 """rad/s: below it a mode is a rigid-body mode, whose stiffness is taken as zero."""
 PASS = 0.3       # upper end of the analysed band over the sampling rate, at most and after decimation
+LINES, OUTSTANDING = 400, 4.0   # bands in which a spectrum is held against its floor, and what stands out of it
 MOST = 240_000   # samples times channels that are analysed
 
 
@@ -43,6 +44,8 @@ class Trial:
         How the noise was got, in a sentence.
     level : float
         rms of the force, or of the response of a free decay: what makes records louder or quieter.
+    bound : bool
+        The noise may be less than stated.
     """
 
     recording: Recording
@@ -50,6 +53,7 @@ class Trial:
     noise: Array
     floor: str
     level: float
+    bound: bool = True
 
     def __post_init__(self) -> None:
         if self.noise.shape != (len(self.recording.channels),):
@@ -136,23 +140,27 @@ def decimated(recording: Recording, top: float, bottom: float = 0.0) -> Recordin
                    period=None if recording.period is None else recording.period // step)
 
 
+def alive(recording: Recording) -> tuple[Recording, Recording | None]:
+    """A transient without its quiet end, and that end, which shows the noise; the whole and None where it has not died away."""
+    whole = recording.n * recording.dt
+    blocks = np.array_split(recording.response - recording.response[-(recording.n // 20 + 1):].mean(axis=0), 40)
+    loud = np.array([np.sqrt(np.mean((b / np.maximum(np.abs(recording.response).max(axis=0), 1e-300)) ** 2)) for b in blocks])
+    quiet = np.median(loud[-5:])
+    living = np.flatnonzero(loud > 4 * quiet)
+    # dead at the end: no more change there, and far below the beginning
+    if not living.size or living[-1] >= 35 or loud.max() <= 20 * quiet or loud[-5:].max() >= 1.5 * loud[-5:].min():
+        return recording, None
+    return recording.window(0.0, (living[-1] + 1) / 40 * whole), recording.window((living[-1] + 3) / 40 * whole, whole)
+
+
 def parted(recording: Recording, share: float) -> tuple[Recording, Recording, Recording | None]:
     """A record in time: what is fitted, what judges, and a quiet end, where a transient has died away, that shows the noise.
 
     Without the last step the end of a decay would judge every model by noise alone.
     """
-    whole = recording.n * recording.dt
-    blocks = np.array_split(recording.response - recording.response[-(recording.n // 20 + 1):].mean(axis=0), 40)
-    loud = np.array([np.sqrt(np.mean((b / np.maximum(np.abs(recording.response).max(axis=0), 1e-300)) ** 2)) for b in blocks])
-    quiet = np.median(loud[-5:])
-    alive = np.flatnonzero(loud > 4 * quiet)
-    end, rest = whole, None
-    # dead at the end: no more change there, and far below the beginning
-    if alive.size and alive[-1] < 35 and loud.max() > 20 * quiet and loud[-5:].max() < 1.5 * loud[-5:].min():
-        end = (alive[-1] + 1) / 40 * whole
-        rest = recording.window((alive[-1] + 3) / 40 * whole, whole)
-    cut = share * end
-    return recording.window(0.0, cut), recording.window(cut, end), rest
+    living, rest = alive(recording)
+    cut = share * living.n * living.dt
+    return living.window(0.0, cut), living.window(cut, living.n * living.dt), rest
 
 
 def _continued(signals: Array, far: int) -> Array:
@@ -174,8 +182,11 @@ def energetic_band(model: ModalModel, recordings: Sequence[Recording], share: fl
             order = {"displacement": 1, "velocity": 0, "acceleration": -1, "force": 0}[channel.quantity]
             power = np.abs(np.fft.rfft((column - column.mean()) * window)) ** 2
             weight = np.where(f > 0.2 * max(float(model.frequency[0]), 4 / (r.n * r.dt)), np.maximum(f, 1e-12) ** (2 * order), 0.0)
-            # white noise is amplified by differentiation: the median of the upper half is no signal
-            power = np.maximum(power - 3 * np.median(power[len(power) // 2:]), 0) * weight
+            # white noise is amplified by differentiation: what hardly stands out of the upper half, over some lines, is no signal
+            lines = max(1, len(power) // LINES)
+            smooth = np.convolve(power, np.ones(lines) / lines, mode="same")
+            floor = float(np.median(smooth[len(smooth) // 2:]))
+            power = np.where(smooth > OUTSTANDING * floor, np.maximum(power - floor, 0.0), 0.0) * weight
             if power.sum() > 0:
                 edge = max(edge, float(f[np.searchsorted(np.cumsum(power) / power.sum(), share)]))
     clock = min(r.fs for r in recordings)
@@ -222,7 +233,8 @@ def make_trial(recording: Recording, use: Use, top: float, floor: NoiseFloor | N
     if floor is not None and floor.sure == "bound":
         noise = np.minimum(noise, _above_the_band(recording, top))
     loud = small.force if small.force.shape[1] and np.abs(small.force).any() else small.response
-    return Trial(small, use, noise, "" if floor is None else floor.how, float(np.sqrt(np.mean(np.square(loud - loud.mean(axis=0))))))
+    return Trial(small, use, noise, "" if floor is None else floor.how, float(np.sqrt(np.mean(np.square(loud - loud.mean(axis=0))))),
+                 floor is None or floor.sure == "bound")
 
 
 def _above_the_band(recording: Recording, top: float) -> Array:

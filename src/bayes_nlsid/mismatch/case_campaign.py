@@ -21,6 +21,7 @@ from bayes_nlsid.mismatch.campaign import (
     Campaign,
     Trial,
     Use,
+    alive,
     campaign_notes,
     energetic_band,
     in_band,
@@ -264,7 +265,7 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
         kept = min(fit, key=lambda i: abs(fit.index(i) - len(fit) // 2))
         records[kept] = (records[kept][0], "judge")
         notes.append(f"Record {records[kept][0].name} was not fitted but kept to judge by.")
-        return records
+        return _living(records)
     out: list[tuple[Recording, Use]] = []
     for recording, use in records:
         periods = recording.n // recording.period if recording.period else 0
@@ -281,6 +282,19 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
         cut = min(max(1, round(SPLIT * periods)), periods - 1) * (recording.period or 0) * recording.dt
         out += [(recording.window(0.0, cut), "fit"), (replace(recording.window(cut, whole), name=f"{recording.name} (rest)"), "judge")]
     notes.append(f"Few open records: the last {100 * (1 - SPLIT):.0f} % of each was not fitted but kept to judge by.")
+    return out
+
+
+def _living(records: list[tuple[Recording, Use]]) -> list[tuple[Recording, Use]]:
+    """Free decays without their quiet ends, the longest of which stands in for a noise record where there is none."""
+    out: list[tuple[Recording, Use]] = []
+    ends: list[Recording] = []
+    for recording, use in records:
+        cut, quiet = alive(recording) if recording.free and use in ("fit", "judge") else (recording, None)
+        out.append((cut, use))
+        ends += [quiet] if quiet is not None and quiet.n >= 64 else []
+    if ends and not any(use == "noise" for _, use in out):
+        out.append((max(ends, key=lambda r: r.n), "noise"))
     return out
 
 

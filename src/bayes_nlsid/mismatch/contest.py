@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import Campaign, Trial
 from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
 from bayes_nlsid.mismatch.innovations import Bench
@@ -74,13 +75,21 @@ def errors_by_block(trials: Sequence[Trial], waves: Sequence[Array], first: Sequ
     return np.array(out)
 
 
-def enter(campaign: Campaign, bench: Bench, weighed: Weighed | None) -> Entrant:
-    """Estimate one hypothesis (None: the linear model) by simulation, from where it settles on the bench."""
+def enter(campaign: Campaign, bench: Bench, weighed: Weighed) -> Entrant:
+    """Estimate one hypothesis by simulation, from where it settles on the bench."""
     linear, drive = bench.linear, bench.drive
-    suspects, factors = ((), ()) if weighed is None else (weighed.suspects, weighed.factors)
-    model = extended(linear, suspects, factors, len(campaign.used("fit")[0].recording.channels), push=_push(campaign))
-    starts = settled(campaign, linear, drive, bench, model) if suspects else []
-    model, waves = estimate(linear, drive, campaign, model, ITERATIONS, starts)
+    model = extended(linear, weighed.suspects, weighed.factors, [t.recording for t in campaign.trials], push=_push(campaign))
+    model, waves = estimate(linear, drive, campaign, model, ITERATIONS, settled(campaign, linear, drive, bench, model))
+    return _entrant(campaign, weighed, model, waves)
+
+
+def enter_linear(campaign: Campaign, linear: Linear, drive: Drive) -> Entrant:
+    """Estimate the linear model by simulation, to the end."""
+    model = extended(linear, (), (), [t.recording for t in campaign.trials], push=_push(campaign))
+    return _entrant(campaign, None, *estimate(linear, drive, campaign, model, 3 * ITERATIONS))
+
+
+def _entrant(campaign: Campaign, weighed: Weighed | None, model: Extended, waves: Sequence[Array]) -> Entrant:
     trials = simulated(campaign)
     blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
     return Entrant(weighed, model, tuple(waves), blocks)
@@ -97,10 +106,8 @@ def polished(campaign: Campaign, bench: Bench, entrant: Entrant, iterations: int
     if entrant.failed or entrant.model.status != "iteration limit":
         return entrant
     model, waves = estimate(bench.linear, bench.drive, campaign, entrant.model, iterations)
-    trials = simulated(campaign)
-    blocks = errors_by_block(trials, waves) if len(waves) == len(trials) else np.full(BLOCKS, np.inf)
-    better = np.isfinite(blocks).all() and blocks.mean() < entrant.blocks.mean() + 0.01
-    return Entrant(entrant.weighed, model, tuple(waves), blocks) if better else entrant
+    tried = _entrant(campaign, entrant.weighed, model, waves)
+    return tried if not tried.failed and tried.blocks.mean() < entrant.blocks.mean() + 0.01 else entrant
 
 
 def champion(campaign: Campaign, bench: Bench, tuned: Entrant, weighed: Weighed) -> Entrant:

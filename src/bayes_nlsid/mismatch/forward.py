@@ -21,6 +21,7 @@ from bayes_nlsid.mismatch.calibrated import Drive, Linear, observer_of
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
 from bayes_nlsid.mismatch.observer import observe
 from bayes_nlsid.mismatch.prove import envelope
+from bayes_nlsid.mismatch.seen import Seen, charge, corrected, modal_channels, modal_locations, unseen
 from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.model import Element, Model
 from bayes_nlsid.recordings.recording import Recording
@@ -32,7 +33,7 @@ START_CYCLES = 6     # of the slowest mode, from which an unknown start is estim
 AT_REST = 0.03
 SAMPLES = 12_000     # of all records that a re-estimation simulates
 SHIFT = 1e-5
-FREQUENCIES = (0.6, 1.5)   # of the linear part beside a law, over those of the best linear model
+FREQUENCIES = (0.6, 1.6)   # of the linear part beside a law, over those as delivered and those of the best linear model
 DAMPING = (0.03, 30.0)
 CLOSE = 4e-3         # error of the integrator, relative, that is accepted here
 OFFSET = Term("constant", "f", (Param("f", "N", "coefficient", meaning="constant force"),), partial(laws.displacement_even, power=0.0),
@@ -40,6 +41,7 @@ OFFSET = Term("constant", "f", (Param("f", "N", "coefficient", meaning="constant
               meaning="constant force: offset of a force channel, weight, static load")
 """c |q|^0, a law that the compiled loop knows."""
 COMPILED = True      # many runs follow each other
+HUGE = 1e100
 
 
 @final
@@ -55,8 +57,8 @@ class Extended:
         ``log``, ``linear`` or ``held``: how each entry of theta moves.
     unit : ndarray (P,)
         Step of one for linear entries.
-    offset : ndarray (s,)
-        Constant of each channel that the fitted records showed.
+    seen : Seen
+        Corrections of the channels that the fitted records showed.
     covariance : ndarray (P, P)
         Of the moving coordinates (zero for held ones).
     status : str
@@ -64,18 +66,21 @@ class Extended:
         Effects beside the linear model.
     low, high : ndarray (P,)
         Between which each parameter must stay.
+    freed : bool
+        Whether linear parameters may move and channels be corrected.
     """
 
     model: Model
     theta: Array
     kind: tuple[str, ...]
     unit: Array
-    offset: Array
+    seen: Seen
     covariance: Array
     status: str = "ok"
     suspects: tuple[Suspect, ...] = ()
     low: Array = field(default_factory=lambda: np.array(-np.inf))
     high: Array = field(default_factory=lambda: np.array(np.inf))
+    freed: bool = True
 
     def at(self, x: Array) -> Array:
         """Theta (K, P) for moves x (K, P) from here, clipped to what the laws admit."""
@@ -88,10 +93,12 @@ class Extended:
         return self.at(np.random.default_rng(seed).standard_normal((count, len(self.theta))) @ root.T)
 
 
-def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[float], channels: int, freed: bool = True,
+def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[float], records: Sequence[Recording], freed: bool = True,
              push: float = 1.0) -> Extended:
     """The linear model with the laws of the suspects; ``freed``: whether its linear parameters may move; ``push``: size of the forces."""
-    base = replace(linear.model, omega=linear.modal.omega, zeta=linear.modal.zeta)
+    bare = linear.model
+    base = replace(bare, omega=linear.modal.omega, zeta=linear.modal.zeta, locations=(*bare.locations, *modal_locations(bare.modes)),
+                   shapes=np.concatenate([bare.shapes, np.eye(bare.modes)]), residual=None)
     forced = bool(base.inputs)
     elements: list[Element] = [Element(OFFSET, (base.inputs[0],), excess=False)] if forced else []
     values: list[float] = [-float(linear.offsets[0])] if forced else []
@@ -127,10 +134,15 @@ def extended(linear: Linear, suspects: Sequence[Suspect], factors: Sequence[floa
     limits = np.array([(-np.inf, np.inf)] * (len(theta) - len(edges)) + edges)
     if not rigid.any() and freed:
         # a law must not take the place of the linear spring
-        limits[:base.modes] = theta[:base.modes, None] * np.array(FREQUENCIES)
-        limits[base.modes:2 * base.modes] = theta[base.modes:2 * base.modes, None] * np.array(DAMPING)
-    return Extended(model, theta, tuple(moves), unit, np.zeros(channels), np.zeros((len(theta), len(theta))), suspects=tuple(suspects),
-                    low=limits[:, 0], high=limits[:, 1])
+        limits[:base.modes] = _around(base.frequency, linear.model.frequency, FREQUENCIES)
+        limits[base.modes:2 * base.modes] = _around(base.zeta, linear.model.zeta, DAMPING)
+    return Extended(model, theta, tuple(moves), unit, unseen(base, records), np.zeros((len(theta), len(theta))), suspects=tuple(suspects),
+                    low=limits[:, 0], high=limits[:, 1], freed=freed)
+
+
+def _around(one: Array, other: Array, reach: tuple[float, float]) -> Array:
+    """Lowest and highest value (m, 2) about two sets of them."""
+    return np.stack([reach[0] * np.minimum(one, other), reach[1] * np.maximum(one, other)], axis=1)
 
 
 @final
@@ -163,8 +175,8 @@ def task_of(linear: Linear, drive: Drive, trial: Trial, ext: Extended, most: int
         start, spread = first_state(linear, drive, trial)
         record = replace(record, period=None)
     u, v = (None, None) if start is None else np.split(start, 2)
-    found = predict_record(ext.model, ext.theta[None], record if record.period else record.window(0.0, min(record.n, 4000) * record.dt),
-                           u0=u, v0=v, tolerance=CLOSE, compiled=COMPILED)
+    piece = record if record.period else record.window(0.0, min(record.n, 4000) * record.dt)
+    found = predict_record(ext.model, ext.theta[None], piece, u0=u, v0=v, tolerance=CLOSE, compiled=COMPILED)
     return Task(trial, record, weight, start, spread, found.substeps)
 
 
@@ -175,7 +187,7 @@ def first_state(linear: Linear, drive: Drive, trial: Trial) -> tuple[Array, Arra
         return np.zeros(2 * linear.model.modes), np.zeros(2 * linear.model.modes)
     count = min(record.n, max(400, early_samples(linear, record)))
     part = replace(trial, recording=replace(record.window(0.0, count * record.dt), period=None))
-    found = observe(observer_of(linear, part, drive), part.recording.response, linear.forces(part))
+    found = observe(observer_of(linear, part, drive), linear.response(part.recording), linear.forces(part))
     quiet = np.abs(record.response[:max(3, count // 40)]).max(axis=0) < AT_REST * np.abs(record.response).max(axis=0)
     if not record.free and quiet.all():
         return np.zeros(2 * linear.model.modes), np.zeros(2 * linear.model.modes)
@@ -192,18 +204,21 @@ def early_samples(linear: Linear, record: Recording) -> int:
 
 
 def simulate_task(ext: Extended, task: Task, theta: Array, starts: Array) -> Array:
-    """Channels (K, n, s) for parameters (K, P) and moves of the start (K, unknown); nan where the simulation fails."""
+    """Modal motion (K, n, q, m), see `seen`, for parameters (K, P) and moves of the start (K, unknown); nan where the simulation fails."""
     u = v = None
     if task.start is not None:
         state = np.tile(task.start, (len(theta), 1))
         state[:, task.spread > 0] += starts * task.spread[task.spread > 0]
         u, v = np.split(state, 2, axis=1)
+    modes = ext.model.linear.modes
+    channels = modal_channels(task.recording, modes)
+    record = replace(task.recording, channels=channels, response=np.zeros((task.recording.n, len(channels))))
     with np.errstate(all="ignore"):
-        found = predict_record(ext.model, theta, task.recording, u0=u, v0=v, substeps=task.substeps, compiled=COMPILED)
+        found = predict_record(ext.model, theta, record, u0=u, v0=v, substeps=task.substeps, compiled=COMPILED)
     values = found.values.copy()
     values[found.status == "diverged"] = np.nan
     values[found.status == "newton"] = np.nan
-    return values
+    return values.reshape(*values.shape[:2], -1, modes)
 
 
 def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, iterations: int = 8, starts: Sequence[Array] = ()
@@ -243,22 +258,28 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
 
     def run(x: Array) -> tuple[Array, list[Array]]:
         theta, starts = unpack(x)
-        waves = [simulate_task(ext, t, theta, s) for t, s in zip(tasks, starts, strict=True)]
-        parts = []
-        for wave, t in zip(waves, tasks, strict=True):
-            difference = wave - t.recording.response
-            difference = difference - _constant(difference, t.weight)
-            parts.append((difference * t.weight).reshape(len(x), -1))
-        return np.concatenate(parts, axis=1), waves
+        motions = [simulate_task(ext, t, theta, s) for t, s in zip(tasks, starts, strict=True)]
+        return np.stack([_residual(ext, tasks, [q[i] for q in motions])[0] for i in range(len(x))]), motions
 
-    x, residual, waves, slope, status = _descend(run, P + sum(sizes), iterations)
+    x, residual, motions, slope, status = _descend(run, P + sum(sizes), iterations)
     if not np.isfinite(residual).all():
         return replace(ext, status="the simulation failed"), []
     theta = unpack(x[None])[0][0]
-    offset = _channel_offset([w[0] for w in waves], tasks, len(ext.offset))
+    _, seen, waves = _residual(ext, tasks, [q[0] for q in motions])
     covariance = np.zeros_like(ext.covariance)
     covariance[np.ix_(moving, moving)] = _covariance(slope, residual, P)
-    return replace(ext, theta=theta, offset=offset, covariance=covariance, status=status), [w[0] + offset for w in waves]
+    return replace(ext, theta=theta, seen=seen, covariance=covariance, status=status), waves
+
+
+def _residual(ext: Extended, tasks: Sequence[Task], motions: Sequence[Array]) -> tuple[Array, Seen, list[Array]]:
+    """Weighted errors (N,) of the channels of modal motions (n, q, m), with the corrections of the channels that make them smallest."""
+    model, records = ext.model.linear, [t.recording for t in tasks]
+    if not all(np.abs(q).max(initial=0.0) < HUGE for q in motions):
+        return np.full(sum(r.response.size for r in records) + ext.seen.shapes.size, np.nan), ext.seen, []
+    seen = corrected(model, records, [t.weight for t in tasks], motions) if ext.freed else ext.seen
+    waves = [seen.wave(model, r, q) for r, q in zip(records, motions, strict=True)]
+    parts = [((w - r.response) * t.weight).ravel() for w, r, t in zip(waves, records, tasks, strict=True)]
+    return np.concatenate([*parts, charge(model, seen)]), seen, waves
 
 
 def _closest(ext: Extended, tasks: Sequence[Task], starts: Sequence[Array]) -> Extended:
@@ -266,12 +287,9 @@ def _closest(ext: Extended, tasks: Sequence[Task], starts: Sequence[Array]) -> E
     if not starts:
         return ext
     thetas = np.array([ext.theta, *starts])
-    cost = np.zeros(len(thetas))
-    for t in tasks:
-        difference = simulate_task(ext, t, thetas, np.zeros((len(thetas), t.unknown))) - t.recording.response
-        with np.errstate(invalid="ignore", over="ignore"):
-            difference = (difference - _constant(difference, t.weight)) * t.weight
-            cost += (difference ** 2).sum(axis=(1, 2))
+    motions = [simulate_task(ext, t, thetas, np.zeros((len(thetas), t.unknown))) for t in tasks]
+    with np.errstate(invalid="ignore", over="ignore"):
+        cost = np.array([(_residual(ext, tasks, [q[i] for q in motions])[0] ** 2).sum() for i in range(len(thetas))])
     cost = np.where(np.isfinite(cost), cost, np.inf)
     # the last start is the most settled one: taken where no simulation can be trusted
     best = int(np.argmin(cost)) if np.isfinite(cost).any() else len(thetas) - 1
@@ -289,18 +307,6 @@ def simulated(campaign: Campaign) -> tuple[Trial, ...]:
             chosen.append(t)
             spent += cost
     return tuple(t for t in campaign.used("fit") if t in chosen)
-
-
-def _constant(difference: Array, weight: Array) -> Array:
-    """Weighted mean over time, (..., 1, s): the offset of each channel."""
-    w = weight ** 2
-    return np.asarray((difference * w).sum(axis=-2, keepdims=True) / w.sum(axis=0))
-
-
-def _channel_offset(waves: Sequence[Array], tasks: Sequence[Task], count: int) -> Array:
-    means = [-_constant(w - t.recording.response, t.weight)[0] for w, t in zip(waves, tasks, strict=True)
-             if w.shape[1] == count]
-    return np.mean(means, axis=0) if means else np.zeros(count)
 
 
 def _descend(run: Any, size: int, iterations: int) -> tuple[Array, Array, list[Array], Array, str]:
@@ -363,13 +369,14 @@ def predict(linear: Linear, drive: Drive, ext: Extended, trial: Trial) -> tuple[
             head = replace(task, recording=task.recording.window(0.0, early * task.recording.dt), weight=task.weight[:early])
 
             def run(x: Array) -> tuple[Array, list[Array]]:
-                wave = simulate_task(ext, head, np.tile(ext.theta, (len(x), 1)), x)
-                return ((wave + ext.offset - head.recording.response) * head.weight).reshape(len(x), -1), [wave]
+                motion = simulate_task(ext, head, np.tile(ext.theta, (len(x), 1)), x)
+                error = ext.seen.wave(ext.model.linear, head.recording, motion) - head.recording.response
+                return (error * head.weight).reshape(len(x), -1), [motion]
 
             at = _descend(run, task.unknown, 6)[0]
         else:
             at = np.zeros(0)
-        wave = simulate_task(ext, task, ext.theta[None], at[None])[0] + ext.offset
+        wave = ext.seen.wave(ext.model.linear, task.recording, simulate_task(ext, task, ext.theta[None], at[None])[0])
     except (ValueError, np.linalg.LinAlgError) as error:
         return np.full(trial.recording.response.shape, np.nan), 0, str(error)
     status = "ok" if np.isfinite(wave).all() else "the simulation failed"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrated import Drive, Linear, best_drive, observer_of
 from bayes_nlsid.mismatch.campaign import Campaign, Trial
 from bayes_nlsid.mismatch.observer import ORDER, Observer, Smoothed, observe
+from bayes_nlsid.mismatch.seen import SHAPE_SD
 from bayes_nlsid.recordings.filtering import smooth_step
 from bayes_nlsid.structure.modal import ModalModel
 
@@ -27,7 +28,6 @@ BLOCKS = 24           # blocks of time, all fitted records together
 LEAST_CYCLES = 4      # of the slowest elastic mode in a block
 PREWHITEN = 16        # order of the autoregression
 TAPS = 3              # samples by which an input chain may smear a force to either side
-SHAPE_SD = 0.1        # prior of a mode-shape error, relative to the largest shape of the mode
 
 
 @final
@@ -164,7 +164,7 @@ def lay_out(campaign: Campaign, linear: Linear, known: Sequence[Array] | None = 
             resolvent = observer.resolvent(N)
             paths[key] = (observer, observer.from_force(N, resolvent), observer.from_channel(resolvent), N)
         observer, to_force, to_channel, N = paths[key]
-        raw.append((trial, observe(observer, record.response, force), force, observer, to_force, to_channel, N))
+        raw.append((trial, observe(observer, linear.response(record), force), force, observer, to_force, to_channel, N))
     plain = [_desk(*entry, np.ones((entry[6] // 2 + 1, entry[1].innovations.shape[1])), np.eye(entry[1].innovations.shape[1]),
                    campaign.top) for entry in raw]
     rough = _assemble(linear, plain, taps, drive)
@@ -181,8 +181,8 @@ def lay_out(campaign: Campaign, linear: Linear, known: Sequence[Array] | None = 
 
 
 def _evened(linear: Linear, desks: Sequence[Desk], taps: bool, drive: Drive) -> list[Desk]:
-    """The same desks, every block weighted by the level of what the linear model leaves there."""
-    for _ in range(2):
+    """The same desks, every block weighted by the level of what the linear model leaves there, to unit variance in all."""
+    for _ in range(3):
         bench = _assemble(linear, desks, taps, drive)
         left = bench.project(bench.innovations)
         out, at = [], 0
@@ -197,13 +197,16 @@ def _evened(linear: Linear, desks: Sequence[Desk], taps: bool, drive: Drive) -> 
             out.append(replace(d, weight=weight))
             at += count
         desks = out
-    return list(desks)
+    bench = _assemble(linear, desks, taps, drive)
+    whole = float(np.sqrt(np.mean(bench.project(bench.innovations) ** 2)))
+    return [replace(d, weight=d.weight / max(whole, 1e-300)) for d in desks]
 
 
 def _desk(trial: Trial, smoothed: Smoothed, force: Array, observer: Observer, to_force: Complex, to_channel: Complex, N: int,
           filters: Complex | Array, root: Array, top: float) -> Desk:
     order = 0 if filters.dtype.kind == "f" else PREWHITEN
     if order:
+        # what lies above the analysed band was taken off by the low-pass, in part
         f = np.arange(N // 2 + 1) / (N * trial.recording.dt)
         filters = filters * (1 - smooth_step(f, top, 1.25 * top))[:, None]
     skip = int(min(observer.memory + order, trial.recording.n // 5))
@@ -270,10 +273,12 @@ def linear_columns(linear: Linear, desks: Sequence[Desk], taps: bool) -> tuple[l
     shared: list[str] = [f"{kind}[{k + 1}]" for kind in ("stiffness", "damping") for k in range(m)]
     shared += [f"{kind}[{name}]" for name in inputs for kind in ("gain", "direct", *(f"tap{j}" for j in _shifts(taps)))]
     channels = list(dict.fromkeys((c.location, c.quantity) for d in desks for c in d.trial.recording.channels))
-    shapes = [(c, k) for c in range(len(channels)) for k in range(m)] if len(channels) > 1 else []
+    shapes = [(c, k) for c in range(len(channels)) for k in range(m)] if len(channels) * m > 1 else []
     shared += [f"shape[{channels[c][0]},{k + 1}{part}]" for part in ("", ",quadrature") for c, k in shapes]
     own = [f"offset[{d.trial.name},{x}]" for d in desks for x in ("force", *(c.name for c in d.trial.recording.channels))]
-    names = shared + own
+    remembered = [d for d in desks if d.skip >= d.n // 5]   # the filter has not forgotten its start where counting begins
+    starts = [f"start[{d.trial.name},{k + 1}]" for d in remembered for k in range(2 * m)]
+    names = shared + own + starts
     parts = []
     for i, d in enumerate(desks):
         part = np.zeros((len(names), (d.n - d.skip) * len(d.trial.recording.channels)))
@@ -294,6 +299,10 @@ def linear_columns(linear: Linear, desks: Sequence[Desk], taps: bool) -> tuple[l
             if other == i:
                 _offset_columns(part[at:at + count], d, model)
             at += count
+        for d_other in remembered:
+            if d_other is d:
+                part[at:at + 2 * m] = _start_columns(d, linear)
+            at += 2 * m
         parts.append(part)
     prior = np.array([SHAPE_SD if n.startswith("shape") else np.inf for n in names])
     return names, parts, prior
@@ -335,6 +344,29 @@ def _offset_columns(part: Array, d: Desk, model: ModalModel) -> None:
     part[0] = d.to_force(row, one)[0]
     for j in range(len(d.trial.recording.channels)):
         part[1 + j] = d.to_channel(j, one)[0]
+
+
+def _start_columns(d: Desk, linear: Linear) -> Array:
+    """What another state at the first sample would do: free vibrations (2 m, ...) of the linear model seen by the channels."""
+    record, out = d.trial.recording, []
+    rows = linear.rows(record.channels)
+    for mode, (k, c) in enumerate(zip(linear.modal.stiffness, linear.modal.damping, strict=True)):
+        root = np.sqrt(complex(c * c / 4 - k))
+        poles = (-c / 2 + root, -c / 2 - root)
+        for part in (0, 1):
+            wave = np.zeros((1, (d.n - d.skip) * len(record.channels)))
+            for j, channel in enumerate(record.channels):
+                order = ORDER[channel.quantity]
+                if abs(root) < 1e-9:
+                    free = ((1.0, 0.0, 0.0), (record.time, 1.0, 0.0))[part][order] + 0.0 * record.time
+                elif root.imag:
+                    vibration = np.exp(poles[0] * record.time) * poles[0] ** order
+                    free = vibration.imag if part else vibration.real
+                else:
+                    free = (np.exp(poles[part] * record.time) * poles[part] ** order).real
+                wave += d.to_channel(j, rows[j, mode] * free[None])
+            out.append(wave[0])
+    return np.array(out)
 
 
 def _blocks(linear: Linear, desks: Sequence[Desk]) -> NDArray[np.intp]:

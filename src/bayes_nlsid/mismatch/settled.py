@@ -28,7 +28,7 @@ SHIFT = 1e-3
 
 
 def settled(campaign: Campaign, linear: Linear, drive: Drive, bench: Bench, ext: Extended) -> list[Array]:
-    """Parameters (P,) of an extended model after every round, best settled last; as many as went well.
+    """Parameters (P,) of an extended model after every round in which the innovations became likelier, best settled last.
 
     Parameters
     ----------
@@ -42,13 +42,17 @@ def settled(campaign: Campaign, linear: Linear, drive: Drive, bench: Bench, ext:
     ext : Extended
     """
     out: list[Array] = []
-    theta, desks = ext.theta, bench
+    theta, desks, likelihood = ext.theta, bench, -np.inf
     for _ in range(ROUNDS):
         try:
             with np.errstate(all="ignore"):
                 base = linear_at(linear, ext, theta)
                 known = known_forces(ext, theta, places_for(desks, ext), desks)
                 desks = lay_out(campaign, base, known, taps=False, drive=drive)
+                reached = float(sum(d.smoothed.likelihood for d in desks.desks))
+                if not reached > likelihood:
+                    return out[:-1]   # the last move led astray
+                likelihood = reached
                 theta = _moved(desks, base, replace(ext, theta=theta), places_for(desks, ext))
         except (np.linalg.LinAlgError, ValueError):
             break

@@ -200,7 +200,7 @@ def channel_response(bench: Bench, location: str, what: str) -> Array:
         for j, c in enumerate(record.channels):
             if c.name == location:
                 # the motion as the model has it there, not the signal itself: a signal always predicts itself
-                z = (d.smoothed.u, d.smoothed.v, d.smoothed.a)[ORDER[c.quantity]] @ bench.linear.model.rows([c.location])[0]
+                z = (d.smoothed.u, d.smoothed.v, d.smoothed.a)[ORDER[c.quantity]] @ bench.linear.rows([c])[0]
                 part += d.to_channel(j, (z if what == "gain" else -np.gradient(z, record.dt))[None])
         parts.append(part)
     return np.concatenate(parts, axis=1)
@@ -212,7 +212,8 @@ def hum_response(bench: Bench, channel: str, mains: float) -> Array:
     for d in bench.desks:
         record = d.trial.recording
         t = record.start + record.time
-        tones = [f(2 * np.pi * h * mains * t) for h in (1, 2, 3) for f in (np.cos, np.sin) if h * mains < 0.45 * record.fs]
+        top = min(0.45, d.part / 2.25) * record.fs   # tones above the analysed band would leave their beginning and end only
+        tones = [f(2 * np.pi * h * mains * t) for h in (1, 2, 3) for f in (np.cos, np.sin) if h * mains < top]
         part = np.zeros((6, (d.n - d.skip) * len(record.channels)))
         for j, c in enumerate(record.channels):
             if c.name == channel and tones:

@@ -1,0 +1,1 @@
+"""Simulated recordings of any kind with known answers: the truth shares no code with the package."""
