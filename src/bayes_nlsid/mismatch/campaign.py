@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 Use = Literal["fit", "judge", "sealed", "noise"]
 RIGID = 1e-3
 """rad/s: below it a mode is a rigid-body mode, whose stiffness is taken as zero."""
-PASS = 0.3       # upper end of the analysed band over the sampling rate, at most and after decimation
+PASS = 0.3       # upper end of the analysed band over the sampling rate, at most
+COARSE = 0.18    # the same after decimation: splines between coarser samples would bend the forces by some per cent
 LINES, OUTSTANDING = 400, 4.0   # bands in which a spectrum is held against its floor, and what stands out of it
 MOST = 240_000   # samples times channels that are analysed
 
@@ -117,7 +118,7 @@ def decimated(recording: Recording, top: float, bottom: float = 0.0) -> Recordin
 
     ``bottom`` (Hz) above zero takes slow motion off too. The filter has no phase; a transient is continued beyond its ends first.
     """
-    step = int(np.floor(PASS * recording.fs / top + 1e-9))
+    step = int(np.floor(COARSE * recording.fs / top + 1e-9))
     periodic = recording.period is not None
     while periodic and step > 1 and (recording.period or 1) % step:
         step -= 1

@@ -76,6 +76,8 @@ class Evidence:
         Of the re-tuned and of the extended model.
     withdrawn : bool
     notes : tuple of str
+    rivals : tuple of Entrant
+        Hypotheses that were estimated by simulation.
     """
 
     campaign: Campaign
@@ -93,6 +95,7 @@ class Evidence:
     bands: tuple[Bands, Bands]
     withdrawn: bool
     notes: tuple[str, ...]
+    rivals: tuple[Entrant, ...] = ()
 
 
 def start_of(campaign: Campaign, nominal: bool = False) -> Linear:
@@ -180,7 +183,7 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     if withdrawn:
         odds = {k: (v * 0.5 if k else 0.5 + 0.5 * v) for k, v in odds.items()}
     return Evidence(campaign, linear, drive, scale, tuple(singles), tuple(pairs), odds, tuned, best, named, shown, scores, bands, withdrawn,
-                    notes)
+                    notes, tuple(rivals))
 
 
 def _one_linear_reading(campaign: Campaign, singles: list[Weighed], pairs: list[Weighed]

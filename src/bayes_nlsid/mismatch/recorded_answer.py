@@ -8,18 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.mismatch.calibrated import Drive, observer_of
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.detected import detect
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.forward import Extended, predict
+from bayes_nlsid.mismatch.innovations import Desk
+from bayes_nlsid.mismatch.observer import Smoothed, observe
 from bayes_nlsid.mismatch.odds import OTHER, Key
 from bayes_nlsid.mismatch.recorded import Evidence, Progress, analyse, silent, start_of, strength
 from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.mismatch.weigh import Weighed, spread
+from bayes_nlsid.recordings.recording import SI_UNIT
 
 Array = NDArray[np.float64]
-LISTED = 12
+LISTED = 16
+WORTH_SAYING = 0.02   # probability of a rival from which the sentence names it
+LATENT = 0.03         # modal force of the observer behind the latent force, at least, over the modal acceleration
 THIN = 6000
 
 
@@ -63,7 +69,7 @@ def _class_probability(odds: dict[Key, float], effects: Key) -> float:
 
 def claims(effects: Key) -> str:
     """The effects in words."""
-    return " and ".join(ROWS[c].claim.format(place=p) for c, p in effects)
+    return " and ".join(ROWS[c].claim.format(place=p).removesuffix(" at -") for c, p in effects)
 
 
 def _named(found: Evidence, seed: int) -> tuple[Named, ...]:
@@ -77,8 +83,8 @@ def _named(found: Evidence, seed: int) -> tuple[Named, ...]:
         effects = key or (("none", "-"),)
         parameters = _parameters(found, key, seed) if p > 0.005 else ()
         out.append(Named(effects, p, parameters, claims(effects), _separates(effects, ordered)))
-    # what is too small to be listed goes to what stands first of the unlisted: outside the list
-    out = [Named(h.effects, h.probability + (rest if h.effects == OTHER else 0.0), h.parameters, h.sentence, h.separated_by) for h in out]
+    # what is too small to be listed is shared out
+    out = [Named(h.effects, h.probability / (1 - rest), h.parameters, h.sentence, h.separated_by) for h in out]
     return tuple(sorted(out, key=lambda h: -h.probability))
 
 
@@ -97,6 +103,9 @@ def _parameters(found: Evidence, key: Key, seed: int) -> tuple[dict[str, Any], .
     """Quantiles of the laws of a hypothesis: from the joint estimate where there is one, else the regression's point."""
     if found.named is not None and key == found.named.key:
         return _intervals(found.best, seed)
+    rival = next((r for r in found.rivals if r.weighed is not None and r.weighed.key == key and not r.failed), None)
+    if rival is not None:
+        return _intervals(rival.model, seed)
     weighed = next((w for w in (*found.singles, *found.pairs) if w.key == key), None)
     if weighed is None:
         return ()
@@ -104,7 +113,9 @@ def _parameters(found: Evidence, key: Key, seed: int) -> tuple[dict[str, Any], .
     for suspect, factor in zip(weighed.suspects, weighed.factors, strict=True):
         if suspect.law is None:
             continue
-        for q, value in zip(suspect.law.term.params, suspect.parameters(factor), strict=True):
+        for q, value, kind in zip(suspect.law.term.params, suspect.parameters(factor), suspect.law.free, strict=True):
+            if kind == "fixed":
+                continue
             width = 1.645 * abs(float(value)) * weighed.error / max(weighed.gain, weighed.error, 1e-9)
             out.append({"name": f"{suspect.law.term.name}[{suspect.place}].{q.name}", "unit": q.unit, "q05": float(value) - width,
                         "q50": float(value), "q95": float(value) + width})
@@ -117,7 +128,16 @@ def _intervals(ext: Extended, seed: int) -> tuple[dict[str, Any], ...]:
     named = [(i, p) for i, p in enumerate(ext.model.parameters) if ext.kind[i] != "held"]
     # the laws first, then the linear parameters estimated along
     named.sort(key=lambda item: (item[1].param is None or item[1].name.startswith("constant"), item[0]))
-    return tuple({"name": p.name, "unit": p.unit, "q05": float(low[i]), "q50": float(middle[i]), "q95": float(high[i])} for i, p in named)
+    out: list[dict[str, Any]] = []
+    modes, omega = ext.model.linear.modes, ext.model.linear.omega
+    for i, p in named:
+        name, unit, factor = p.name, p.unit, 1.0
+        if modes <= i < 2 * modes and omega[i - modes] < RIGID:
+            # a rigid body has no damping ratio: viscous damping over mass
+            name, unit, factor = f"damping[{i - modes + 1}]", "1/s", 2 * float(omega[i - modes])
+        out.append({"name": name, "unit": unit, "q05": factor * float(low[i]), "q50": factor * float(middle[i]),
+                    "q95": factor * float(high[i])})
+    return tuple(out)
 
 
 def _where(found: Evidence) -> dict[str, Any]:
@@ -265,22 +285,31 @@ def _sentence(found: Evidence, verdict: str, p: float, hypotheses: tuple[Named, 
     many = len(found.shown) != 1
     end = (f"On {len(found.shown)} record{'s' if many else ''} that {'were' if many else 'was'} not used the error "
            f"is {_percent(s['nominal'])} as delivered and {_percent(s['updated'])} with the best linear re-tuning")
+    noise = "sensor noise is negligible" if s["noise"] < 1e-5 else f"sensor noise alone makes {_percent(s['noise'])}"
     if verdict == "none":
-        return f"Beyond what a re-tuned linear model explains nothing was found (probability {100 * (1 - p):.0f} %). {end}; sensor noise " \
-               f"alone makes {_percent(s['noise'])}."
+        return f"Beyond what a re-tuned linear model explains nothing was found (probability {100 * (1 - p):.0f} %). {end}; {noise}."
     top = next(h for h in hypotheses if h.effects != (("none", "-"),))
     place = next((q for _, q in top.effects if q != "-"), "-")
     alike: list[str] = next((x["indistinguishable_from"] for x in where["locations"] if x["name"] == place), [])
     places = place + (f" (not to be told from {', '.join(alike)})" if alike else "")
     words = top.sentence.replace(place, places, 1) if place != "-" else top.sentence
-    share = _class_probability(found.odds, top.effects)
+    share = _listed(hypotheses, top.effects)
     own = {c for c, _ in top.effects}
-    rival = next((h for h in hypotheses if h.effects != (("none", "-"),) and {c for c, _ in h.effects} != own), None)
-    follow = f"; next, {rival.sentence} ({100 * _class_probability(found.odds, rival.effects):.0f} %)" if rival is not None else ""
-    proof = f", and {_percent(s['extended'])} with what was found" if found.named is not None else ""
+    rivals = [h for h in hypotheses if h.effects != (("none", "-"),) and {c for c, _ in h.effects} != own]
+    rival = max(rivals, key=lambda h: _listed(hypotheses, h.effects), default=None)
+    follow = f"; next, {rival.sentence} ({100 * _listed(hypotheses, rival.effects):.0f} %)" \
+        if rival is not None and _listed(hypotheses, rival.effects) > WORTH_SAYING else ""
+    helped = found.named is not None
+    end = end.replace(" and ", ", ") if helped else end
+    proof = f", and {_percent(s['extended'])} with what was found" if helped else ""
     lead = "The recordings differ from any linear model" if verdict == "mismatch" else "It cannot be told for sure what is missing"
-    return (f"{lead} (p = {min(p, 0.999):.3g}). Likeliest: {words} ({100 * share:.0f} %){follow}. {end}{proof}; sensor noise alone makes "
-            f"{_percent(s['noise'])}.")
+    return f"{lead} (p = {min(p, 0.999):.3g}). Likeliest: {words} ({100 * share:.0f} %){follow}. {end}{proof}; {noise}."
+
+
+def _listed(hypotheses: tuple[Named, ...], effects: Key) -> float:
+    """Probability of all listed hypotheses of the same classes."""
+    own = {c for c, _ in effects}
+    return sum(h.probability for h in hypotheses if {c for c, _ in h.effects} == own)
 
 
 def _sealed(found: Evidence) -> dict[str, Array]:
@@ -296,6 +325,16 @@ def _sealed(found: Evidence) -> dict[str, Array]:
     return out
 
 
+def _freely(found: Evidence, desk: Desk) -> Smoothed:
+    """A record smoothed by an observer whose modal forces are free to follow it: where the mismatch is faint the likeliest ones are not."""
+    largest = np.maximum(found.drive.force, (LATENT * desk.smoothed.a.std(axis=0)) ** 2)
+    observer = observer_of(found.linear, desk.trial, Drive(largest, found.drive.noise))
+    try:
+        return observe(observer, found.linear.response(desk.trial.recording), desk.force)
+    except (np.linalg.LinAlgError, ValueError):
+        return desk.smoothed
+
+
 def _figures(found: Evidence) -> dict[str, NDArray[Any]]:
     """Numbers behind the figures."""
     ranked = sorted(found.odds.items(), key=lambda kv: -kv[1])[:LISTED]
@@ -309,12 +348,14 @@ def _figures(found: Evidence) -> dict[str, NDArray[Any]]:
         "hypothesis_names": np.array(names), "hypothesis_probability": np.array([p for _, p in ranked]),
         "place_names": np.array(places), "place_share": np.array([shares[n] for n in places])}
     desk = max(found.scale.bench.desks, key=lambda d: d.trial.level)
+    moved = _freely(found, desk)
     for i, name in enumerate(places[:3]):
         row = found.linear.model.rows([name])[0]
-        force = -(desk.smoothed.latent @ row) / float(row @ row)
-        q, v, a = (z @ row for z in (desk.smoothed.u, desk.smoothed.v, desk.smoothed.a))
+        force = -(moved.latent @ row) / float(row @ row)
+        q, v, a = (z @ row for z in (moved.u, moved.v, moved.a))
         # what a linear model may absorb is taken off, so that the shape of the rest can be seen
-        design = np.stack([q, v, a, np.ones_like(q)], axis=1)
+        # (without a measured force the inertia is the force, and nothing would be left without it)
+        design = np.stack([q, v, *([] if desk.trial.recording.free else [a]), np.ones_like(q)], axis=1)
         norm = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
         force = force - (design / norm) @ np.linalg.lstsq(design / norm, force, rcond=1e-9)[0]
         every = max(1, len(q) // THIN)
@@ -325,6 +366,9 @@ def _figures(found: Evidence) -> dict[str, NDArray[Any]]:
         piece = slice(first, min(t.recording.n, first + THIN))
         out["heldout_time"] = t.recording.time[piece]
         out["heldout_measured"] = t.recording.response[piece]
+        out["heldout_channels"] = np.array([c.name for c in t.recording.channels])
+        out["heldout_units"] = np.array([SI_UNIT[c.quantity] for c in t.recording.channels])
+        out["heldout_name"] = np.array(t.name)
         for key, s in zip(("nominal", "updated", "extended"), found.shown[t.name], strict=True):
             if np.isfinite(s.wave).all() and (key != "extended" or found.named is not None):
                 out[f"heldout_{key}"] = s.wave[piece]

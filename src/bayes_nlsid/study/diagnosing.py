@@ -85,7 +85,7 @@ def _pictures(found: Diagnosis) -> dict[str, tuple[bytes, str]]:
         places = np.asarray(f.get("place_names", np.array([], dtype=str)))
         image = png(draw.hypotheses, f["hypothesis_names"].tolist(), f["hypothesis_probability"], places.tolist(),
                     f.get("place_share", np.zeros(0)))
-        out["hypotheses"] = (image, "Probability of every explanation that was weighed, and how much of the mismatch a free force at each "
+        out["hypotheses"] = (image, "Probability of every explanation that was weighed, and how much of the mismatch a force at each "
                                     "place would explain.")
     latents = [{"place": str(f["place_names"][i]), **{k: f[f"latent_{i}_{k}"] for k in ("force", "displacement", "velocity")}}
                for i in range(3) if f"latent_{i}_force" in f]
@@ -102,9 +102,16 @@ def _pictures(found: Diagnosis) -> dict[str, tuple[bytes, str]]:
         facts = ", ".join(f"{name} {100 * found.heldout[key]:.3g} %" for name, key in (
             ("NRMSE as delivered", "nrmse_nominal"), ("re-tuned", "nrmse_updated_linear"), ("extended", "nrmse_extended"))
             if found.heldout.get(key) is not None)
-        out["before_after"] = (png(draw.before_after, f["heldout_time"], waves, facts), "A record that was not used: the error of the "
-                               "model as delivered, and on a finer scale those of the re-tuned and of the extended model.")
+        channels, units = (np.asarray(f.get(f"heldout_{key}", [])).tolist() for key in ("channels", "units"))
+        image = png(draw.before_after, f["heldout_time"], waves, _of_record(f) + facts, channels, units)
+        out["before_after"] = (image, "A record that was not used: the error of the model as delivered, and on a finer scale those of the "
+                                      "re-tuned and of the extended model.")
     return out
+
+
+def _of_record(figures: Mapping[str, Any]) -> str:
+    """Which record is drawn, if that is stored."""
+    return f"in {figures['heldout_name']}; over all records not used: " if "heldout_name" in figures else ""
 
 
 def _page(found: Diagnosis, pictures: Mapping[str, tuple[bytes, str]]) -> str:

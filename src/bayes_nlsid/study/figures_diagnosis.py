@@ -23,14 +23,24 @@ def hypotheses(names: Sequence[str], probability: Array, places: Sequence[str], 
     at = np.arange(len(order))
     left.barh(at, 100 * probability[order], color=BLUE, height=0.6)
     for row, i in enumerate(order):
-        left.text(100 * probability[i] + 1, row, f"{100 * probability[i]:.0f} %", va="center", fontsize=7.5)
-    left.set(yticks=at, yticklabels=[names[i].replace("@-", "").replace("@", " at ") for i in order], ylim=(len(order) - 0.4, -0.6),
-             xlim=(0, 112), xlabel="probability (%)")
+        words = f"{100 * probability[i]:.0f} %" if probability[i] >= 0.005 else "< 1 %"
+        left.text(100 * probability[i] + 1, row, words, va="center", fontsize=7.5)
+    left.set(yticks=at, yticklabels=[_words(names[i]) for i in order], ylim=(len(order) - 0.4, -0.6), xlim=(0, 112),
+             xlabel="probability (%)")
     at = np.arange(len(where))
     right.barh(at, 100 * shares[where], color=ORANGE, height=0.6)
-    right.set(yticks=at, yticklabels=[places[i] for i in where], ylim=(max(len(where), 1) - 0.4, -0.6), xlim=(0, 105),
-              xlabel="explained by a free force there (%)")
+    right.set(yticks=at, yticklabels=[places[i] for i in where], ylim=(max(len(where), 4) - 0.4, -0.6), xlim=(0, 105),
+              xlabel="explained by a force there (%)")
     return figure
+
+
+def _words(name: str) -> str:
+    """``class@place + class@place`` as it is read."""
+    parts = []
+    for part in name.split(" + "):
+        cls, _, place = part.partition("@")
+        parts.append(cls.replace("_", " ") + (f" at {place}" if place not in ("", "-") else ""))
+    return " + ".join(parts)
 
 
 def transfer_functions(frequency: Array, measured: Array, linear: Array, lines: Array, residual: Array, noise: Array) -> Figure:
@@ -86,24 +96,27 @@ def latent_forces(latents: Sequence[Mapping[str, object]]) -> Figure:
     return figure
 
 
-def before_after(time: Array, waves: Mapping[str, Array], facts: str) -> Figure:
+def before_after(time: Array, waves: Mapping[str, Array], facts: str, channels: Sequence[str] = (), units: Sequence[str] = ()) -> Figure:
     """A record not used: measured, and the errors of the model as delivered, re-tuned, and extended.
 
     Parameters
     ----------
     time : ndarray (n,) s
     waves : dict
-        ``measured``, ``nominal``, ``updated``, ``extended``, each (n, s) m/s².
+        ``measured``, ``nominal``, ``updated``, ``extended``, each (n, s).
     facts : str
         One line of numbers.
+    channels, units : sequence of str (s,)
+        Names, and m/s², m/s or m; numbered accelerations if not given.
     """
     c = int(np.argmax(waves["measured"].std(axis=0)))
+    name_of = channels[c] if len(channels) > c else f"sensor {c + 1}"
     names = [("nominal", "model as delivered", GREY), ("updated", "linear model, re-tuned", ORANGE),
              ("extended", "with what was found", BLUE)]
     shown = [entry for entry in names if entry[0] in waves]
     figure, grid = canvas(1 + len(shown), 1, height=1.0 + 1.05 * (1 + len(shown)), sharex=True)
     measured = waves["measured"][:, c]
-    factor, unit = prefixed(measured, "m/s^2")
+    factor, unit = prefixed(measured, units[c] if len(units) > c else "m/s^2")
     size = factor * float(np.abs(measured).max()) * 1.05
     grid[0][0].plot(time, factor * measured, color="black", linewidth=0.6)
     grid[0][0].set_ylabel(f"measured\n({unit})", fontsize=8)
@@ -114,8 +127,11 @@ def before_after(time: Array, waves: Mapping[str, Array], facts: str) -> Figure:
     left = [factor * float(np.abs(measured - waves[n][:, c]).max()) for n, _, _ in shown if n != "nominal"]
     fine = 1.05 * max(left, default=size) or size
     for row, axes in enumerate(grid[:, 0]):
-        common = row == 0 or shown[row - 1][0] == "nominal"  # the two best share a finer scale
-        axes.set(ylim=(-size, size) if common else (-fine, fine), xlim=(time[0], time[-1]))
+        # the two best share a finer scale
+        limit = size if row == 0 else fine
+        if row and shown[row - 1][0] == "nominal":
+            limit = max(size, 1.05 * factor * float(np.abs(measured - waves["nominal"][:, c]).max()))
+        axes.set(ylim=(-limit, limit), xlim=(time[0], time[-1]))
     grid[-1][0].set_xlabel("time (s)")
-    figure.suptitle(f"sensor {c + 1}   {facts}", x=0.01, ha="left", fontsize=8.5)
+    figure.suptitle(f"{name_of}   {facts}", x=0.01, ha="left", fontsize=8.5)
     return figure
