@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.case_campaign import campaign_from_case, needs_general
 from bayes_nlsid.mismatch.diagnosis import Diagnosis
 from bayes_nlsid.mismatch.innovations import lay_out
-from bayes_nlsid.mismatch.odds import odds_of, something
+from bayes_nlsid.mismatch.odds import Candidate, Findings, bench_findings, findings_from, odds_of, something
 from bayes_nlsid.mismatch.recorded import start_of
 from bayes_nlsid.mismatch.recorded_answer import diagnose_campaign
 
@@ -152,6 +152,17 @@ def test_damaged_channels_and_records_cost_a_sentence_not_the_analysis(tmp_path:
 
 
 def test_odds_sum_to_one_and_nothing_is_claimed_from_nothing() -> None:
-    odds = odds_of([], [], 1000.0)
+    nothing_found = bench_findings([], [], 1000.0)
+    odds = odds_of(nothing_found)
     assert sum(odds.values()) == pytest.approx(1.0) and odds[()] > 0.9
-    assert something(None, 1000.0) < 0.05
+    assert something(nothing_found) < 0.05
+
+
+def test_what_simulation_finds_worse_loses_odds_and_findings_survive_their_file() -> None:
+    one, other = (("hardening", "J1"),), (("clearance", "J1"),)
+    found = Findings((Candidate(one, 400.0, 0.0), Candidate(other, 390.0, 8.0)), (), 1000.0, error=30.0)
+    held = Findings(found.singles, (), 1000.0, error=30.0, simulated=((one, 2.0, 0.1), (other, 0.0, 0.0)), lead=9.0, judged=(3.0, 0.2),
+                    left=0.01, noise=0.005)
+    assert odds_of(found)[one] > odds_of(found)[other] and odds_of(held)[other] > 0.8
+    again = findings_from(json.loads(json.dumps(held.as_dict())))
+    assert odds_of(again) == pytest.approx(odds_of(held))

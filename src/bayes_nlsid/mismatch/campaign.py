@@ -24,6 +24,8 @@ RIGID = 1e-3
 """rad/s: below it a mode is a rigid-body mode, whose stiffness is taken as zero."""
 PASS = 0.3       # upper end of the analysed band over the sampling rate, at most
 COARSE = 0.18    # the same after decimation: splines between coarser samples would bend the forces by some per cent
+AT_REST = 0.02   # of the largest force, below which there is none
+ROLL = 1.6       # upper end of what the low-pass lets through in part, over the upper end of the band
 LINES, OUTSTANDING = 400, 4.0   # bands in which a spectrum is held against its floor, and what stands out of it
 MOST = 240_000   # samples times channels that are analysed
 
@@ -124,7 +126,7 @@ def decimated(recording: Recording, top: float, bottom: float = 0.0) -> Recordin
         step -= 1
     if step <= 1 and bottom <= 0:
         return recording
-    stop = 0.48 * recording.fs / max(step, 1)
+    stop = min(0.48 * recording.fs / max(step, 1), ROLL * top)
     signals = np.concatenate([recording.response, recording.force], axis=1)
     n = len(signals)
     far = 0 if periodic else min(n - 1, int(16 * recording.fs / (min(top, 4 * bottom) if bottom > 0 else top)))
@@ -149,19 +151,27 @@ def alive(recording: Recording) -> tuple[Recording, Recording | None]:
     quiet = np.median(loud[-5:])
     living = np.flatnonzero(loud > 4 * quiet)
     # dead at the end: no more change there, and far below the beginning
-    if not living.size or living[-1] >= 35 or loud.max() <= 20 * quiet or loud[-5:].max() >= 1.5 * loud[-5:].min():
+    if not living.size or living[-1] >= 35 or loud.max() <= 20 * quiet or loud[-5:].max() >= 2.5 * loud[-5:].min():
         return recording, None
+    after = recording.force[int((living[-1] + 3) / 40 * recording.n):]
+    if recording.force.size and np.abs(after).max(initial=0.0) > AT_REST * np.abs(recording.force).max():
+        return recording, None   # a sweep that has passed the resonance is not quiet
     return recording.window(0.0, (living[-1] + 1) / 40 * whole), recording.window((living[-1] + 3) / 40 * whole, whole)
 
 
 def parted(recording: Recording, share: float) -> tuple[Recording, Recording, Recording | None]:
     """A record in time: what is fitted, what judges, and a quiet end, where a transient has died away, that shows the noise.
 
-    Without the last step the end of a decay would judge every model by noise alone.
+    Without the last step the end of a decay would judge every model by noise alone. The loudest motion is fitted: where it comes late,
+    as in a sweep, the beginning judges.
     """
     living, rest = alive(recording)
-    cut = share * living.n * living.dt
-    return living.window(0.0, cut), living.window(cut, living.n * living.dt), rest
+    whole = living.n * living.dt
+    level = np.abs(living.response - living.response.mean(axis=0)) / np.maximum(living.response.std(axis=0), 1e-300)
+    loudest = int(np.argmax([np.mean(b ** 2) for b in np.array_split(level, 20)]))
+    if not living.free and loudest >= 20 * share:
+        return living.window((1 - share) * whole, whole), living.window(0.0, (1 - share) * whole), rest
+    return living.window(0.0, share * whole), living.window(share * whole, whole), rest
 
 
 def _continued(signals: Array, far: int) -> Array:

@@ -281,7 +281,8 @@ def _with_judge(records: list[tuple[Recording, Use]], notes: list[str]) -> list[
         whole = recording.n * recording.dt
         cut = min(max(1, round(SPLIT * periods)), periods - 1) * (recording.period or 0) * recording.dt
         out += [(recording.window(0.0, cut), "fit"), (replace(recording.window(cut, whole), name=f"{recording.name} (rest)"), "judge")]
-    notes.append(f"Few open records: the last {100 * (1 - SPLIT):.0f} % of each was not fitted but kept to judge by.")
+    notes.append(f"Few open records: the last {100 * (1 - SPLIT):.0f} % of each (the first, where the loudest motion comes late) was not "
+                 "fitted but kept to judge by.")
     return out
 
 

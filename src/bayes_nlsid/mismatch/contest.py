@@ -17,7 +17,7 @@ from bayes_nlsid.mismatch.calibrated import Drive, Linear
 from bayes_nlsid.mismatch.campaign import Campaign, Trial
 from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
 from bayes_nlsid.mismatch.innovations import Bench
-from bayes_nlsid.mismatch.odds import LAYER, Key, OddsLayer, rises
+from bayes_nlsid.mismatch.odds import Key
 from bayes_nlsid.mismatch.settled import settled
 from bayes_nlsid.mismatch.weigh import Weighed, searched
 
@@ -182,10 +182,7 @@ def classes(w: Weighed) -> frozenset[str]:
 
 
 def second(entrants: Sequence[Entrant]) -> float:
-    """Factor on the odds of two effects against one: what a pair must show in simulation beside the better of its members.
-
-    1 where no pair was simulated beside a member.
-    """
+    """Lead in simulation of the best pair over the better of its members; nan where no pair was simulated beside a member."""
     worth = []
     for e in entrants:
         assert e.weighed is not None
@@ -194,8 +191,8 @@ def second(entrants: Sequence[Entrant]) -> float:
             alone = [m for m in members if not m.failed]
             if alone:
                 best = min(alone, key=lambda m: float(m.blocks.mean()))
-                worth.append(0.02 if e.failed else rises(max(ahead(best.blocks, e.blocks), 1e-3), 1.5, 3.0))
-    return max(worth, default=1.0)
+                worth.append(0.0 if e.failed else max(ahead(best.blocks, e.blocks), 0.0))
+    return max(worth, default=float("nan"))
 
 
 def modelled(w: Weighed) -> bool:
@@ -204,52 +201,39 @@ def modelled(w: Weighed) -> bool:
     return len(terms) == len(w.suspects) and len(set(terms)) == len(terms)
 
 
-def tilts(entrants: Sequence[Entrant], layer: OddsLayer = LAYER) -> dict[Key, float]:
-    """Factor (at most one) on the odds of every hypothesis that was simulated, by how it compares with the best of them."""
+def compared(entrants: Sequence[Entrant]) -> tuple[tuple[Key, float, float], ...]:
+    """Every hypothesis that was simulated against the best of them: mean difference of the logarithmic block errors and its standard error;
+    inf where the simulation failed."""
     able = [e for e in entrants if not e.failed]
-    if not able:
-        return {}
-    best = min(able, key=lambda e: float(e.blocks.mean()))
-    out: dict[Key, float] = {}
+    best = min(able, key=lambda e: float(e.blocks.mean()), default=None)
+    out: list[tuple[Key, float, float]] = []
     for e in entrants:
         assert e.weighed is not None
-        if e.failed:
-            out[e.weighed.key] = (1 + 4.0) ** -layer.power
+        if best is None or e.failed:
+            out.append((e.weighed.key, float("inf"), 0.0))
             continue
-        difference = e.blocks - best.blocks
-        error = float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
         # parameters beyond those of the better rival are not charged here: block means differ by far more than they take
-        out[e.weighed.key] = (1 + max(float(difference.mean()), 0.0) / (0.1 + error)) ** -layer.power
-    return out
+        difference = e.blocks - best.blocks
+        out.append((e.weighed.key, float(difference.mean()), float(np.std(difference, ddof=1) / np.sqrt(len(difference)))))
+    return tuple(out)
 
 
-def proof(before: Array, after: Array) -> float:
-    """Probability that something is missing, from records that were not fitted.
+def lead(tuned: Entrant, entrants: Sequence[Entrant]) -> float:
+    """Lead of the best simulated hypothesis over the linear model; nan if none was simulated."""
+    able = [ahead(tuned.blocks, e.blocks) for e in entrants if not e.failed] if not tuned.failed else []
+    return max(able, default=0.0 if entrants and not tuned.failed else float("nan"))
+
+
+def fallen(before: Array, after: Array) -> tuple[float, float]:
+    """Mean decrease of logarithmic block errors on records that were not fitted, and its standard error; zeros where it cannot be said.
 
     Parameters
     ----------
     before, after : ndarray (B,)
         `errors_by_block` of the best linear and of the extended model.
-
-    Returns
-    -------
-    float
-        Near zero unless the error falls clearly (by a third, as a rule) and in most blocks.
     """
     gain = before - after
     gain = gain[np.isfinite(gain)]
     if len(gain) < 4 or not np.isfinite(before).all() or not np.isfinite(after).all():
-        return 0.0
-    error = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
-    mean = float(gain.mean())
-    return min(0.999, rises(float(np.exp(mean / 2)), 1.4, 9.0) * rises(mean / (error + 0.05), 2.5, 4.0)) if mean > 0 else 0.0
-
-
-def unexplained_error(error: float, noise: float) -> float:
-    """Probability that something is missing that no law here explains: the best linear model misses records by far more than noise.
-
-    Kept below one half for errors of some per cent, which model error within a band alone can make.
-    """
-    if not (np.isfinite(error) and np.isfinite(noise)) or error <= 0:
-        return 0.0
-    return 0.9 * rises(error, 0.15, 3.0) * rises(error / max(noise, 1e-9), 10.0, 2.0)
+        return 0.0, 0.0
+    return float(gain.mean()), float(np.std(gain, ddof=1) / np.sqrt(len(gain)))

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrated import Drive, Linear, best_drive
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign, Trial
-from bayes_nlsid.mismatch.contest import Entrant, enter_linear, errors_by_block, hold, polished, proof, second, tilts, unexplained_error
+from bayes_nlsid.mismatch.contest import Entrant, compared, enter_linear, errors_by_block, fallen, hold, lead, polished, second
 from bayes_nlsid.mismatch.forward import Extended, extended, predict, simulated
 from bayes_nlsid.mismatch.innovations import Bench, lay_out
 from bayes_nlsid.mismatch.observer import Modal
-from bayes_nlsid.mismatch.odds import OTHER, Key, odds_of
+from bayes_nlsid.mismatch.odds import Findings, Key, bench_findings, odds_of
 from bayes_nlsid.mismatch.prove import Bands, calibrate_bands, elpd_difference
 from bayes_nlsid.mismatch.refit import refitted
 from bayes_nlsid.mismatch.settled import linear_at
@@ -32,7 +32,6 @@ Progress = Callable[[float, str], None]
 RETUNINGS = 3
 SANE = float(np.log(0.5))   # block error (logarithm of its square) up to which a simulated linear model is believed
 WORSE = 1.02
-WITHDRAWN = 0.1   # factor on the odds of what made records that were not used worse
 
 
 def silent(share: float, sentence: str) -> None:
@@ -78,6 +77,8 @@ class Evidence:
     notes : tuple of str
     rivals : tuple of Entrant
         Hypotheses that were estimated by simulation.
+    findings : Findings
+        What the odds were made from.
     """
 
     campaign: Campaign
@@ -95,7 +96,8 @@ class Evidence:
     bands: tuple[Bands, Bands]
     withdrawn: bool
     notes: tuple[str, ...]
-    rivals: tuple[Entrant, ...] = ()
+    rivals: tuple[Entrant, ...]
+    findings: Findings
 
 
 def start_of(campaign: Campaign, nominal: bool = False) -> Linear:
@@ -153,16 +155,17 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     pairs = doubles(scale, singles, progress=lambda share: say(0.4 + 0.1 * share, "weighing pairs"))
     singles, pairs, notes = _one_linear_reading(campaign, singles, pairs)
     values = float(bench.counts.sum())
-    odds = odds_of(singles, pairs, values)
+    findings = bench_findings(singles, pairs, values)
+    odds = odds_of(findings)
     rivals = hold(campaign, bench, linear_one, singles, pairs, odds, say)
-    tilt, more = tilts(rivals), second(rivals)
+    findings = replace(findings, simulated=compared(rivals), lead=lead(linear_one, rivals), beside=second(rivals))
     tuned = linear_one.model
     nominal = extended(start_of(campaign, nominal=True), (), (), [t.recording for t in campaign.trials], freed=False)
     say(0.85, "simulating records that were not used")
     plain = {t.name: (_shown(start_of(campaign, nominal=True), drive, nominal, t), _shown(linear, drive, tuned, t))
              for t in campaign.used("judge")}
     leader, shown, bands, scores, failed = linear_one, _with(plain, None), (_bands(campaign, linear_one.waves),) * 2, {}, []
-    for rival in (*_standing(linear_one, rivals, odds_of(singles, pairs, values, tilt=tilt, second=more)), linear_one):
+    for rival in (*_standing(linear_one, rivals, odds_of(findings)), linear_one):
         leader = polished(campaign, bench, rival)
         shown = _with(plain, {t.name: _shown(linear, drive, leader.model, t) for t in campaign.used("judge")} if leader.weighed else None)
         bands = (_bands(campaign, linear_one.waves), _bands(campaign, leader.waves))
@@ -171,19 +174,17 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
             break
         failed.append(leader.weighed.key)
     best, named = leader.model, leader.weighed
-    sure = _proved(campaign, shown) if named is not None else 0.0
     withdrawn = named is None and bool(failed)
     notes += tuple(f"With {' and '.join(f'{c} at {p}' for c, p in key)} the records that were not used are simulated worse than with the "
                    "re-tuned linear model; it was withdrawn." for key in failed)
-    tilt = {k: v * (WITHDRAWN if k in failed else 1.0) for k, v in tilt.items()}
     notes += tuple(f"Record {n} is simulated worse with what was found than without it, though all together are simulated better."
                    for n in worse(campaign, shown))
-    odds = odds_of(singles, pairs, values, _unexplained(scores) if named is not None else 0.0, sure, tilt, more)
-    odds = _outside(odds, scores)
-    if withdrawn:
-        odds = {k: (v * 0.5 if k else 0.5 + 0.5 * v) for k, v in odds.items()}
+    findings = replace(findings, judged=_judged(campaign, shown) if named is not None else (0.0, 0.0),
+                       unexplained=_unexplained(scores) if named is not None else 0.0, left=scores["extended"], noise=scores["noise"],
+                       withdrawn=tuple(failed))
+    odds = odds_of(findings)
     return Evidence(campaign, linear, drive, scale, tuple(singles), tuple(pairs), odds, tuned, best, named, shown, scores, bands, withdrawn,
-                    notes, tuple(rivals))
+                    notes, tuple(rivals), findings)
 
 
 def _one_linear_reading(campaign: Campaign, singles: list[Weighed], pairs: list[Weighed]
@@ -212,14 +213,14 @@ def _with(plain: dict[str, tuple[Shown, Shown]], extended: dict[str, Shown] | No
     return {name: (a, b, b if extended is None else extended[name]) for name, (a, b) in plain.items()}
 
 
-def _proved(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> float:
+def _judged(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> tuple[float, float]:
     """What records that were not fitted say for the extended model against the re-tuned one."""
     trials = campaign.used("judge")
     if not trials:
-        return 0.0
+        return 0.0, 0.0
     first = [max(s.first for s in shown[t.name]) for t in trials]
     before, after = (errors_by_block(trials, [shown[t.name][i].wave for t in trials], first) for i in (1, 2))
-    return proof(before, after)
+    return fallen(before, after)
 
 
 def worse(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> list[str]:
@@ -231,13 +232,6 @@ def worse(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]]) -> l
         if after > WORSE ** 2 * before + float(np.mean(t.noise ** 2)):
             out.append(t.name)
     return out
-
-
-def _outside(odds: dict[Key, float], scores: dict[str, float]) -> dict[Key, float]:
-    """Odds in which what no law explains, though it is large, is counted as outside the catalogue rather than as nothing."""
-    strange = unexplained_error(scores.get("extended", np.nan), scores.get("noise", np.nan))
-    nothing = odds.get((), 0.0)
-    return {**odds, (): nothing * (1 - strange), OTHER: odds.get(OTHER, 0.0) + nothing * strange}
 
 
 def _shown(linear: Linear, drive: Drive, ext: Extended, trial: Trial) -> Shown:

@@ -59,7 +59,7 @@ def diagnose_campaign(campaign: Campaign, seed: int = 0, say: Progress = silent)
     sentence = _sentence(found, verdict, p, hypotheses, where)
     notes = (*campaign.notes, *retuned(found), *told, *found.notes, *_statuses(found))
     return Diagnosis(campaign.name, seed, clock.perf_counter() - begun, verdict, p, where, hypotheses, heldout, sentence, detection,
-                     tuple(dict.fromkeys(notes)), _sealed(found), _figures(found))
+                     tuple(dict.fromkeys(notes)), _sealed(found), _figures(found), found.findings.as_dict())
 
 
 def _class_probability(odds: dict[Key, float], effects: Key) -> float:

@@ -53,8 +53,8 @@ def campaign_of(study: Study) -> Campaign:
     if not judged:
         fitted, judged, quiet = _split(fitted)
         recordings += quiet
-        notes.append(f"No record is marked for judging (role = \"holdout\"): the last {100 * (1 - SPLIT):.0f} % of every record was kept "
-                     "for that and not fitted.")
+        notes.append(f"No record is marked for judging (role = \"holdout\"): the last {100 * (1 - SPLIT):.0f} % of every record (the "
+                     "first, where the loudest motion comes late) was kept for that and not fitted.")
     top = _top(study, start, fitted)
     entry = study.identification
     bottom = lower_edge(start, fitted, 0.0 if entry is None or entry.band is None else entry.band[0])
