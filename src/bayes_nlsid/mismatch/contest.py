@@ -19,12 +19,13 @@ from bayes_nlsid.mismatch.forward import Extended, estimate, extended, simulated
 from bayes_nlsid.mismatch.innovations import Bench
 from bayes_nlsid.mismatch.odds import Key
 from bayes_nlsid.mismatch.settled import settled
-from bayes_nlsid.mismatch.weigh import Weighed, searched
+from bayes_nlsid.mismatch.weigh import Weighed, searched, spread
 
 Array = NDArray[np.float64]
 ITERATIONS = 12
 LAWS = 3        # of one class that are tried
 CHARGE = 0.01   # of the logarithm of squared error, for each parameter of a law
+PLACES, NEAR = 2, 0.3   # other places at which the leading class is tried, and how much less they may gain on the bench
 RIVALS = 5      # hypotheses of different classes that are estimated jointly
 BLOCKS = 24
 LOUD = 3.0      # error of the best linear model over noise from which rivals are simulated whatever the bench says
@@ -159,7 +160,7 @@ def hold(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequence[Wei
     floor = np.mean([np.log(np.mean(t.noise ** 2 / (np.mean(t.recording.response ** 2, axis=0) + t.noise ** 2 + 1e-300)) + 1e-12)
                      for t in trials])
     loud = tuned.failed or float(np.median(tuned.blocks)) > max(float(floor), np.log(1e-8)) + 2 * np.log(LOUD)
-    ranked = sorted((w for w in (*singles, *pairs) if modelled(w) and w.gain > 0 and (loud or odds.get(w.key, 0.0) > 0.02)),
+    ranked = sorted((w for w in (*singles, *pairs) if modelled(w) and (loud or (w.gain > 0 and odds.get(w.key, 0.0) > 0.02))),
                     key=lambda w: -odds.get(w.key, 0.0))
     chosen: list[Weighed] = []
     for w in ranked:
@@ -173,7 +174,20 @@ def hold(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequence[Wei
     for i, w in enumerate(chosen):
         say(0.55 + 0.3 * i / len(chosen), "estimating " + " and ".join(f"{c} at {p}" for c, p in w.key))
         out.append(champion(campaign, bench, tuned, w))
-    return out
+    say(0.8, "estimating the leading class at other places")
+    return out + _elsewhere(campaign, bench, tuned, singles, out)
+
+
+def _elsewhere(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequence[Weighed], entrants: Sequence[Entrant]) -> list[Entrant]:
+    """The class that simulates best alone, estimated at the next places too: on the bench places differ by little."""
+    alone = [e for e in entrants if e.weighed is not None and len(e.weighed.key) == 1 and not e.failed]
+    best = min(alone, key=lambda e: float(e.blocks.mean()), default=None)
+    if best is None or best.weighed is None or tuned.failed or ahead(tuned.blocks, best.blocks) < 1.0:
+        return []
+    own = best.weighed
+    near = [w for w in singles if classes(w) == classes(own) and w.key != own.key and modelled(w)
+            and own.gain - w.gain < NEAR * abs(own.gain) + 3 * spread(own.blocks - w.blocks) + 10.0]
+    return [champion(campaign, bench, tuned, w) for w in near[:PLACES]]
 
 
 def classes(w: Weighed) -> frozenset[str]:

@@ -89,7 +89,8 @@ class Extended:
 
     def draws(self, count: int, seed: int) -> Array:
         """Parameters (count, P) from the normal approximation."""
-        root = np.linalg.cholesky(self.covariance + 1e-14 * np.eye(len(self.theta)))
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)   # semidefinite up to rounding
+        root = vectors * np.sqrt(np.clip(values, 0.0, 25.0))
         return self.at(np.random.default_rng(seed).standard_normal((count, len(self.theta))) @ root.T)
 
 

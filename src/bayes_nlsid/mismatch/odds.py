@@ -37,6 +37,8 @@ class OddsLayer:
         Gain over its standard error at which it is as likely as not.
     seen, blind : float
         Lead of the best simulated rival over the linear model, in its error, at which the bench is believed; share of belief without.
+    shown : float
+        The same lead at which simulation alone makes it as likely as not that something is missing.
     scale, share, power : float
         Odds against a rival: (1 + difference / (scale + standard error + share · best gain)) ** −power.
     useless : float
@@ -58,6 +60,7 @@ class OddsLayer:
     surety: float = 2.2
     seen: float = 0.5
     blind: float = 0.5
+    shown: float = 4.0
     scale: float = 3.0
     share: float = 0.02
     power: float = 2.5
@@ -147,11 +150,11 @@ def findings_from(stored: Mapping[str, Any]) -> Findings:
     def group(raw: Any) -> tuple[Candidate, ...]:
         return tuple(Candidate(key(c["key"]), float(c["gain"]), float(c["behind"])) for c in raw)
 
-    return Findings(group(stored["singles"]), group(stored["pairs"]), float(stored["values"]), number(stored["error"]),
-                    number(stored["more"]), number(stored["more_error"]),
-                    tuple((key(k), number(a, np.inf), number(b, 0.0)) for k, a, b in stored["simulated"]), number(stored["lead"]), number(stored["beside"]), (number(stored["judged"][0]), number(stored["judged"][1])),
-                    number(stored["unexplained"]), number(stored["left"]), number(stored["noise"]),
-                    tuple(key(k) for k in stored["withdrawn"]))
+    simulated = tuple((key(k), number(a, np.inf), number(b, 0.0)) for k, a, b in stored["simulated"])
+    judged = (number(stored["judged"][0]), number(stored["judged"][1]))
+    single = ("error", "more", "more_error", "lead", "beside", "unexplained", "left", "noise")
+    return Findings(group(stored["singles"]), group(stored["pairs"]), float(stored["values"]), simulated=simulated, judged=judged,
+                    withdrawn=tuple(key(k) for k in stored["withdrawn"]), **{name: number(stored[name]) for name in single})
 
 
 def bench_findings(singles: Sequence[Weighed], pairs: Sequence[Weighed], values: float) -> Findings:
@@ -209,12 +212,16 @@ def strange_error(f: Findings) -> float:
 
 def odds_of(f: Findings, layer: OddsLayer = LAYER) -> dict[Key, float]:
     """Probability of every hypothesis, of none (empty key) and of something outside the catalogue; they sum to one, largest first."""
-    missing = 1 - (1 - something(f, layer)) * (1 - proved(f, layer))
+    shown = 0.0 if np.isnan(f.lead) else 0.97 * rises(max(f.lead, 1e-3), layer.shown, 4.0)
+    missing = 1 - (1 - something(f, layer)) * (1 - proved(f, layer)) * (1 - shown)
     double = two(f, layer)
     tilt = {key: (1 + max(mean, 0.0) / (layer.floor + error)) ** -layer.along if np.isfinite(mean) else 5.0 ** -layer.along
             for key, mean, error in f.simulated}
-    # a class is simulated at its likeliest place only; what that says holds for its other places
-    alike = {frozenset(cls for cls, _ in key): value for key, value in tilt.items()}
+    # a class is simulated at its likeliest places only; what that says holds for its others
+    alike: dict[frozenset[str], float] = {}
+    for key, value in tilt.items():
+        own = frozenset(cls for cls, _ in key)
+        alike[own] = max(alike.get(own, 0.0), value)
     weights: dict[Key, float] = {}
     for group, share in ((f.singles, 1 - double), (f.pairs, double)):
         raw = _raw(group, layer)
