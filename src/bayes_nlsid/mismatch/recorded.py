@@ -180,8 +180,8 @@ def analyse(campaign: Campaign, say: Progress = silent) -> Evidence:
     notes += tuple(f"Record {n} is simulated worse with what was found than without it, though all together are simulated better."
                    for n in worse(campaign, shown))
     findings = replace(findings, judged=_judged(campaign, shown) if named is not None else (0.0, 0.0),
-                       unexplained=_unexplained(scores, linear_one, leader) if named is not None else 0.0, left=scores["extended"], noise=scores["noise"],
-                       withdrawn=tuple(failed))
+                       unexplained=_unexplained(scores, linear_one, leader) if named is not None else 0.0,
+                       left=scores["extended"], noise=scores["noise"], withdrawn=tuple(failed))
     odds = odds_of(findings)
     return Evidence(campaign, linear, drive, scale, tuple(singles), tuple(pairs), odds, tuned, best, named, shown, scores, bands, withdrawn,
                     notes, tuple(rivals), findings)
@@ -278,8 +278,8 @@ def score_all(campaign: Campaign, shown: dict[str, tuple[Shown, Shown, Shown]], 
 
 
 def _unexplained(scores: dict[str, float], tuned: Entrant, leader: Entrant) -> float:
-    """Share of the re-tuned model's error energy, noise apart, that the extended model leaves: on judged records, or on fitted ones where the
-    effect shows more."""
+    """Share of the re-tuned model's error energy, noise apart, that the extended model leaves: on judged records, or on fitted ones where
+    the effect shows more."""
     before = scores["updated"] ** 2 - scores["noise"] ** 2
     after = scores["extended"] ** 2 - scores["noise"] ** 2
     fitted = float(np.exp(min(leader.blocks.mean() - tuned.blocks.mean(), 0.0))) if not (tuned.failed or leader.failed) else 1.0
