@@ -50,13 +50,14 @@ def cache_directory(source: str) -> str:
     return ""
 
 
-def compiled(function: Callable[..., Any]) -> Any:
-    """The function compiled by numba, kept on disk if a directory can be written, else compiled anew in each process."""
+def compiled(function: Callable[..., Any], **options: Any) -> Any:
+    """The function compiled by numba (with more of its options), kept on disk if a directory can be written, else compiled anew in each
+    process."""
     directory = cache_directory(inspect.getfile(function))
     settings: Any = numba.config
     before, settings.CACHE_DIR = settings.CACHE_DIR, directory
     try:
-        return numba.njit(cache=bool(directory), error_model="numpy")(function)
+        return numba.njit(cache=bool(directory), error_model="numpy", **options)(function)
     finally:
         settings.CACHE_DIR = before
 

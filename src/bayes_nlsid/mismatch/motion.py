@@ -8,7 +8,8 @@ with the best linear stiffness and damping of the law along the current motion (
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -33,13 +34,34 @@ class LawAlong:
         ``force(d, v, dt) -> (n,)`` along one period or burst, memory honoured inside.
     slope : callable or None
         ``slope(d, v) -> (dg/dd, dg/dv)``, if the force depends on the present motion only.
+    code : tuple of (int, float) or None
+        Number of the law for compiled code (``forces.compiled.law_code``), if it has one.
+    values : ndarray
+        Its parameters.
     """
 
     force: Callable[[Array, Array, float], Array]
     slope: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    code: tuple[int, float] | None = None
+    values: Array = field(default_factory=lambda: np.zeros(0))
 
 
 FINER = 2  # samples of the simulation per sample of the recording
+MARCHED = 4  # steps of a march in the order of time per sample of the simulation
+QUICK = 2.0  # rad per step beyond which a mode is taken as a spring
+
+
+@final
+@dataclass(frozen=True)
+class Steps:
+    """One step of a march: ``own``, ``forced`` (4, m), ``b`` (J, m) and ``yielding`` (J, J) as in ``simulation.modal_march``; ``back`` (K, m):
+    modal response to a unit force one step earlier."""
+
+    own: Array
+    forced: Array
+    b: Array
+    yielding: Array
+    back: Complex
 
 
 @final
@@ -61,6 +83,10 @@ class Bed:
     window : ndarray (samples,)
         exp(-alpha t), 1 for periodic records.
     periodic : bool
+    modes : Modes or None
+        Of the structure, if nothing but its modes stands behind the paths: what a march in the order of time needs.
+    rows : ndarray (J, m)
+        Of the places in these modes.
     """
 
     s: Complex
@@ -71,6 +97,26 @@ class Bed:
     dt: float
     window: Array
     periodic: bool
+    modes: Modes | None = None
+    rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def at(self, places: list[int]) -> Bed:
+        """Some of the places alone."""
+        return replace(self, to_force=self.to_force[:, places], among=self.among[:, places][:, :, places],
+                       rows=self.rows[places] if self.modes is not None else self.rows)
+
+    @cached_property
+    def steps(self) -> Steps:
+        """What one step of a march in the order of time needs; the highest modes are springs."""
+        from bayes_nlsid.simulation.modal_march import propagators
+
+        assert self.modes is not None
+        dt = self.dt / MARCHED
+        low = self.modes.omega * dt < QUICK
+        high = self.rows[:, ~low] / self.modes.omega[~low]
+        own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)
+        back = np.exp(-self.s * dt)[:, None] / self.modes.denominators(self.s)[:, low]
+        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back)
 
     def linear(self, record: int) -> Complex:
         """(K, J): motion without any law."""
@@ -106,19 +152,24 @@ def bed(modes: Modes, spectra: Spectra, rows: Array, shaker: Array, attach: Atta
     samples = finer * block
     count = samples // 2 + 1
     s = np.asarray(spectra.alpha + 2j * np.pi * np.arange(count) * spectra.rate / block, dtype=complex)
-    full = receptances(modes, s, rows, np.concatenate([rows, shaker[None]]), attach(s) if attach is not None else ())
+    attached = attach(s) if attach is not None else ()
+    full = receptances(modes, s, rows, np.concatenate([rows, shaker[None]]), attached)
     time = spectra.waveforms if waveforms is None else waveforms
     decay = np.exp(-spectra.alpha * np.arange(block) / spectra.rate)
     drive = np.zeros((len(time), count), dtype=complex)
     half = np.fft.rfft(time * decay, axis=1) / block
     drive[:, :half.shape[1] - 1] = half[:, :-1]
     grid = np.exp(-spectra.alpha * np.arange(samples) / (finer * spectra.rate))
-    return Bed(s, full[:, :, -1], full[:, :, :-1], drive, samples, 1 / (finer * spectra.rate), grid, spectra.kind == "steady")
+    return Bed(s, full[:, :, -1], full[:, :, :-1], drive, samples, 1 / (finer * spectra.rate), grid, spectra.kind == "steady",
+               None if attached else modes, rows @ modes.basis)
 
 
 def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None = None, most: int = 40,
            tolerance: float = 1e-5) -> tuple[Complex, Complex, str]:
     """Motion and force at every place in one record.
+
+    Laws without memory on nothing but modes are marched in the order of time; else (attachments, memory, no compiled code) the fixed
+    point is sought over the whole record.
 
     Parameters
     ----------
@@ -133,21 +184,17 @@ def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
     if any(law.slope is None for law in laws):
         D, G, error = _relax(paths, record, laws, start, most, tolerance)
         return D, G, _status(error, tolerance)
+    if paths.modes is not None and len(laws) <= 2 and all(law.code is not None for law in laws):
+        D, G, sound = _march(paths, record, laws)
+        if sound:
+            return D, G, "ok"
     turns = max(most // 3, 4)
+    best: tuple[Complex, Complex, float] = paths.linear(record), np.zeros_like(paths.linear(record)), np.inf
     if start is not None or paths.periodic:
-        D, G, error = _newton(paths, record, laws, start, turns, tolerance)
-        if error < 30 * tolerance or most < 30:
-            return D, G, _status(error, tolerance)
-        best = D, G, error
-    else:
-        best = paths.linear(record), np.zeros_like(paths.linear(record)), np.inf
-    # a strong law, or a burst: find a start in the order of time, or by raising the force little by little
-    for attempt in (_sweep, _raise):
-        found = _newton(paths, record, laws, attempt(paths, record, laws), turns, tolerance)
-        if found[2] < best[2]:
-            best = found
-        if best[2] < 30 * tolerance:
-            break
+        best = _newton(paths, record, laws, start, turns, tolerance)
+    if best[2] >= 30 * tolerance and most >= 30:
+        found = _newton(paths, record, laws, _sweep(paths, record, laws), turns, tolerance)
+        best = min((best, found), key=lambda x: x[2])
     return best[0], best[1], _status(best[2], tolerance)
 
 
@@ -155,15 +202,41 @@ def _status(error: float, tolerance: float) -> str:
     return "ok" if error < 30 * tolerance else "not converged"
 
 
-def _raise(paths: Bed, record: int, laws: tuple[LawAlong, ...]) -> Complex:
-    """A first guess by continuation in the level of the force."""
-    D = 0.2 * paths.linear(record)
-    level = 0.2
-    for new in (0.2, 0.4, 0.6, 0.8):
-        scaled = replace(paths, drive=paths.drive * new)
-        D, _, _ = _newton(scaled, record, laws, D * (new / level), 8, 1e-3)
-        level = new
-    return np.asarray(D / level)
+def _march(paths: Bed, record: int, laws: tuple[LawAlong, ...], passes: int = 4) -> tuple[Complex, Complex, bool]:
+    """Motion, force and whether they are sound, from a march in the order of time: a burst once, a period until it closes on itself."""
+    from bayes_nlsid.simulation.modal_march import march_modes
+
+    steps, linear = paths.steps, paths.linear(record)
+    n = MARCHED * paths.samples
+    decay = np.exp(np.arange(n) / MARCHED * np.log(paths.window[1]))    # 1 for periodic records
+    rows = np.ascontiguousarray(linear.T)
+    q0, v0 = (np.ascontiguousarray((np.fft.irfft(x, n, axis=1, norm="forward") / decay).T) for x in (rows, paths.s * rows))
+    codes, powers = (np.array([law.code[k] for law in laws if law.code is not None]) for k in (0, 1))
+    values = np.zeros((len(laws), max(max(len(law.values) for law in laws), 1)))
+    for j, law in enumerate(laws):
+        values[j, :len(law.values)] = law.values
+    g, state, before = np.zeros((n, len(laws))), np.zeros((2, steps.b.shape[1])), np.zeros(len(laws))
+    kept, lost, closed = np.zeros(0), 0, not paths.periodic
+    for _ in range(passes if paths.periodic else 1):
+        lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, codes, powers, values, g, state, before)
+        G = np.asarray(np.fft.rfft(g * decay[:, None], axis=0, norm="forward")[:len(paths.s)])
+        if not paths.periodic or not np.isfinite(g).all():
+            break
+        change = float(np.abs(g - kept).max() / max(float(np.abs(g).max()), 1e-300)) if len(kept) else 1.0
+        closed = change < 0.05
+        if change < 1e-3:
+            break
+        kept, before = g.copy(), g[-1].copy()
+        # the state at the start of a period that these forces would make steady; one step back, where the march takes it up
+        X = (G @ steps.b) * steps.back
+        state = np.stack([_first(X), _first(paths.s[:, None] * X)])
+    D = linear - _mul(paths.among, G)
+    return D, G, bool(np.isfinite(g).all() and closed and lost < 1e-3 * n)
+
+
+def _first(lines: Complex) -> Array:
+    """Value in time at t = 0 of spectra (K, m) of real signals."""
+    return np.asarray(lines[0].real + 2 * lines[1:].real.sum(axis=0))
 
 
 def _rest(paths: Bed, linear: Complex, D: Complex, laws: tuple[LawAlong, ...]) -> tuple[Complex, Complex, Array, Array, Array]:
@@ -195,8 +268,9 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
     size = np.linalg.norm(linear) + 1e-300
     rest, G, d, v, g = _rest(paths, linear, D, laws)
     error = np.linalg.norm(rest) / size
+    slow = 0
     for _ in range(most):
-        if not np.isfinite(error) or error < tolerance:
+        if not np.isfinite(error) or error < tolerance or slow > 1:
             break
         slopes = [law.slope(d[:, j], v[:, j]) for j, law in enumerate(laws) if law.slope is not None]
         stiff = np.stack([np.broadcast_to(a, len(d)) for a, _ in slopes], axis=1)
@@ -226,6 +300,7 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
         if not accepted:
             break
         D = D + length * step
+        slow += int(new > 0.5 * error)    # from near the solution it converges in a few turns or not at all
         (rest, G, d, v, g), error = trial, new
     return D, G, float(error) if np.isfinite(error) else np.inf
 

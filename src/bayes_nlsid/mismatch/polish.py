@@ -15,6 +15,9 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces.library import LIBRARY
+from bayes_nlsid.forces.march import compiled_wanted
+from bayes_nlsid.forces.term import Term
 from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored, predict
 from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence
@@ -92,9 +95,21 @@ def law_of(effect: Effect, time: float, periodic: bool) -> LawAlong:
     """The force of an effect along a motion, in a record taken at ``time`` (−1 to 1 over the test day of the fitted records)."""
     if effect.law is None:
         stiffness = float(np.interp(time, effect.knots, effect.values))
-        return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))))
+        return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))),
+                        _code(LIBRARY["spring"]), np.array([stiffness]))
     force = partial(_along, effect, periodic)
-    return LawAlong(force, None if effect.law.term.memory != "none" else partial(_slope, effect))
+    if effect.law.term.memory != "none":
+        return LawAlong(force)
+    return LawAlong(force, partial(_slope, effect), _code(effect.law.term), np.asarray(effect.values, dtype=float))
+
+
+def _code(term: Term) -> tuple[int, float] | None:
+    """Number of a law for compiled code, where that is to be had."""
+    if not compiled_wanted():
+        return None
+    from bayes_nlsid.forces.compiled import law_code
+
+    return law_code(term)
 
 
 def _along(effect: Effect, periodic: bool, d: Array, v: Array, dt: float) -> Array:
@@ -153,7 +168,7 @@ def everywhere(bench: Bench, h: Hypothesis, places: list[str]) -> tuple[Bed, lis
     rows = np.array([fam.places[p] for p in places])
     paths = bed(h.fit.fields.modes, spectra, rows, fam.shaker, lambda s: h.parts(channels)(s)[0])
     at = [places.index(e.place) for e in h.forces]
-    own = replace(paths, to_force=paths.to_force[:, at], among=paths.among[:, at][:, :, at])
+    own = paths.at(at)
     times = day(spectra, spectra.starts)
     found = simulate(own, spectra, h.forces, repeats(spectra), None)
     out = []
