@@ -28,13 +28,13 @@ def linear_motion(t, amplitude=30.0, frequency=22.0):
     return x @ ROWS.T, v @ ROWS.T
 
 
-def marched(names, values, dt, seconds=0.4, still=np.zeros((2, 2)), modes=slice(None)):
+def marched(names, values, dt, seconds=0.4, still=((0.0, 0.0), (0.0, 0.0)), modes=slice(None)):
     t = dt * np.arange(1, round(seconds / dt) + 1)
     q0, v0 = (np.ascontiguousarray(x[:, :len(names)]) for x in linear_motion(t))
     codes = [law_code(LIBRARY[n]) for n in names]
     own, forced = propagators(OMEGA[modes], ZETA[modes], dt)
     g, b = np.zeros((len(t), len(names))), np.ascontiguousarray(ROWS[:len(names), modes])
-    lost = march_modes(q0, v0, own, forced, b, np.ascontiguousarray(still[:len(names), :len(names)]), np.array([c[0] for c in codes]),
+    lost = march_modes(q0, v0, own, forced, b, np.ascontiguousarray(np.array(still)[:len(names), :len(names)]), np.array([c[0] for c in codes]),
                        np.array([c[1] for c in codes]), np.array(values, dtype=float), g, np.zeros((2, b.shape[1])), np.zeros(len(names)))
     assert lost == 0
     return t, g

@@ -54,8 +54,10 @@ QUICK = 2.0  # rad per step beyond which a mode is taken as a spring
 @final
 @dataclass(frozen=True)
 class Steps:
-    """One step of a march: ``own``, ``forced`` (4, m), ``b`` (J, m) and ``yielding`` (J, J) as in ``simulation.modal_march``; ``back`` (K, m):
-    modal response to a unit force one step earlier."""
+    """One step of a march: ``own``, ``forced`` (4, m), ``b`` (J, m) and ``yielding`` (J, J) as in ``simulation.modal_march``.
+
+    ``back`` (K, m): modal response to a unit force one step earlier.
+    """
 
     own: Array
     forced: Array
