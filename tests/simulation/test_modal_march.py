@@ -34,7 +34,8 @@ def marched(names, values, dt, seconds=0.4, still=((0.0, 0.0), (0.0, 0.0)), mode
     codes = [law_code(LIBRARY[n]) for n in names]
     own, forced = propagators(OMEGA[modes], ZETA[modes], dt)
     g, b = np.zeros((len(t), len(names))), np.ascontiguousarray(ROWS[:len(names), modes])
-    lost = march_modes(q0, v0, own, forced, b, np.ascontiguousarray(np.array(still)[:len(names), :len(names)]), np.array([c[0] for c in codes]),
+    static = np.ascontiguousarray(np.array(still)[:len(names), :len(names)])
+    lost = march_modes(q0, v0, own, forced, b, static, np.array([c[0] for c in codes]),
                        np.array([c[1] for c in codes]), np.array(values, dtype=float), g, np.zeros((2, b.shape[1])), np.zeros(len(names)))
     assert lost == 0
     return t, g
