@@ -218,7 +218,8 @@ def _march(paths: Bed, record: int, laws: tuple[LawAlong, ...], passes: int = 4)
     for j, law in enumerate(laws):
         values[j, :len(law.values)] = law.values
     g, state, before = np.zeros((n, len(laws))), np.zeros((2, steps.b.shape[1])), np.zeros(len(laws))
-    kept, lost, closed = np.zeros(0), 0, not paths.periodic
+    kept: Array = np.zeros(0)
+    lost, closed = 0, not paths.periodic
     for _ in range(passes if paths.periodic else 1):
         lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, codes, powers, values, g, state, before)
         G = np.asarray(np.fft.rfft(g * decay[:, None], axis=0, norm="forward")[:len(paths.s)])
