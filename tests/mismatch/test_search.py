@@ -10,7 +10,7 @@ from bayes_nlsid.mismatch.effects import Effect
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.explain import Candidate, scan_forces, scan_linear
 from bayes_nlsid.mismatch.linear import solve
-from bayes_nlsid.mismatch.motion import bed
+from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Bench, estimate
 from tests.mismatch.test_mathematics import chain_family, cubic, steady
 

@@ -20,7 +20,7 @@ from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.evidence import Evidence, gather, level_transfer
 from bayes_nlsid.mismatch.explain import sizes
 from bayes_nlsid.mismatch.linear import Family, family
-from bayes_nlsid.mismatch.motion import bed
+from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis
 from bayes_nlsid.mismatch.probability import SHIPPED, Key, Layer, Score, Scores, probabilities
 from bayes_nlsid.mismatch.prove import Bands, Predictor, calibrate_bands, elpd_difference, nrmse

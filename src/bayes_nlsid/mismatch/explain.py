@@ -20,7 +20,7 @@ from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.laws import Law, Size
 from bayes_nlsid.mismatch.linear import Family, Modes, receptances
-from bayes_nlsid.mismatch.motion import Bed, bed
+from bayes_nlsid.mismatch.paths import Bed, bed
 from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import System, assemble, finish, floored, stack
 from bayes_nlsid.mismatch.effects import Effect, extension, unpack
 from bayes_nlsid.mismatch.linear import solve
-from bayes_nlsid.mismatch.motion import bed
+from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import (
     Bench,
     Hypothesis,

@@ -7,164 +7,15 @@ with the best linear stiffness and damping of the law along the current motion (
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.krylov import gmres
-from bayes_nlsid.mismatch.linear import Attachment, Modes, receptances
-from bayes_nlsid.mismatch.spectra import Spectra
+from bayes_nlsid.mismatch.marching import march_laws
+from bayes_nlsid.mismatch.paths import Bed, LawAlong, forces_along, through
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-Attached = Callable[[Complex], tuple[Attachment, ...]] | None
-
-
-@final
-@dataclass(frozen=True)
-class LawAlong:
-    """A law as the solver sees it.
-
-    Parameters
-    ----------
-    force : callable
-        ``force(d, v, dt) -> (n,)`` along one period or burst, memory honoured inside.
-    slope : callable or None
-        ``slope(d, v) -> (dg/dd, dg/dv)``, if the force depends on the present motion only.
-    code : tuple of (int, float) or None
-        Number of the law for compiled code (``forces.compiled.law_code``), if it has one.
-    values : ndarray
-        Its parameters.
-    """
-
-    force: Callable[[Array, Array, float], Array]
-    slope: Callable[[Array, Array], tuple[Array, Array]] | None = None
-    code: tuple[int, float] | None = None
-    values: Array = field(default_factory=lambda: np.zeros(0))
-
-
-FINER = 2  # samples of the simulation per sample of the recording
-MARCHED = 4  # steps of a march in the order of time per sample of the simulation
-QUICK = 2.0  # rad per step beyond which a mode is taken as a spring
-
-
-@final
-@dataclass(frozen=True)
-class Steps:
-    """One step of a march: ``own``, ``forced`` (4, m), ``b`` (J, m) and ``yielding`` (J, J) as in ``simulation.modal_march``.
-
-    ``back`` (K, m): modal response to a unit force one step earlier.
-    """
-
-    own: Array
-    forced: Array
-    b: Array
-    yielding: Array
-    back: Complex
-
-
-@final
-@dataclass(frozen=True)
-class Bed:
-    """Linear paths between the force and some places on all lines of the simulation grid.
-
-    Parameters
-    ----------
-    s : ndarray complex (K,)
-    to_force : ndarray complex (K, J)
-        Motion of each place per shaker force, m/N.
-    among : ndarray complex (K, J, J)
-        Motion of place i per force at place j.
-    drive : ndarray complex (R, K)
-        Force spectra.
-    samples : int
-    dt : float
-    window : ndarray (samples,)
-        exp(-alpha t), 1 for periodic records.
-    periodic : bool
-    modes : Modes or None
-        Of the structure, if nothing but its modes stands behind the paths: what a march in the order of time needs.
-    rows : ndarray (J, m)
-        Of the places in these modes.
-    """
-
-    s: Complex
-    to_force: Complex
-    among: Complex
-    drive: Complex
-    samples: int
-    dt: float
-    window: Array
-    periodic: bool
-    modes: Modes | None = None
-    rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
-
-    def at(self, places: list[int]) -> Bed:
-        """Some of the places alone."""
-        return replace(self, to_force=self.to_force[:, places], among=self.among[:, places][:, :, places],
-                       rows=self.rows[places] if self.modes is not None else self.rows)
-
-    @cached_property
-    def steps(self) -> Steps:
-        """What one step of a march in the order of time needs; the highest modes are springs."""
-        from bayes_nlsid.simulation.modal_march import propagators
-
-        assert self.modes is not None
-        dt = self.dt / MARCHED
-        low = self.modes.omega * dt < QUICK
-        high = self.rows[:, ~low] / self.modes.omega[~low]
-        own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)
-        back = np.exp(-self.s * dt)[:, None] / self.modes.denominators(self.s)[:, low]
-        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back)
-
-    def linear(self, record: int) -> Complex:
-        """(K, J): motion without any law."""
-        return np.asarray(self.to_force * self.drive[record][:, None])
-
-    def in_time(self, D: Complex) -> tuple[Array, Array]:
-        """Displacement and velocity (samples, J) of a spectrum (K, J)."""
-        rows = np.ascontiguousarray(D.T)
-        return self.wave(rows), self.wave(self.s * rows)
-
-    def wave(self, rows: Complex) -> Array:
-        """(samples, J) in time from spectra (J, K)."""
-        out = np.fft.irfft(rows, self.samples, axis=1, norm="forward")
-        return np.asarray((out if self.periodic else out / self.window).T)
-
-    def to_lines(self, force: Array) -> Complex:
-        """Spectrum (K, J) of forces (samples, J)."""
-        rows = np.ascontiguousarray(force.T)
-        return np.asarray(np.fft.rfft(rows if self.periodic else rows * self.window, axis=1, norm="forward").T)
-
-
-def bed(modes: Modes, spectra: Spectra, rows: Array, shaker: Array, attach: Attached = None, waveforms: Array | None = None,
-        finer: int = FINER) -> Bed:
-    """Paths on the grid of a group of records.
-
-    Parameters
-    ----------
-    rows : (J, n) places; ``shaker`` (n,).
-    attach : callable ``s -> tuple of Attachment``, or None.
-    waveforms : (R, block) forces in time, N; those of ``spectra`` by default.
-    """
-    block = spectra.block
-    samples = finer * block
-    count = samples // 2 + 1
-    s = np.asarray(spectra.alpha + 2j * np.pi * np.arange(count) * spectra.rate / block, dtype=complex)
-    attached = attach(s) if attach is not None else ()
-    full = receptances(modes, s, rows, np.concatenate([rows, shaker[None]]), attached)
-    time = spectra.waveforms if waveforms is None else waveforms
-    decay = np.exp(-spectra.alpha * np.arange(block) / spectra.rate)
-    drive = np.zeros((len(time), count), dtype=complex)
-    half = np.fft.rfft(time * decay, axis=1) / block
-    drive[:, :half.shape[1] - 1] = half[:, :-1]
-    grid = np.exp(-spectra.alpha * np.arange(samples) / (finer * spectra.rate))
-    return Bed(s, full[:, :, -1], full[:, :, :-1], drive, samples, 1 / (finer * spectra.rate), grid, spectra.kind == "steady",
-               None if attached else modes, rows @ modes.basis)
 
 
 def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None = None, most: int = 40,
@@ -188,7 +39,7 @@ def settle(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
         D, G, error = _relax(paths, record, laws, start, most, tolerance)
         return D, G, _status(error, tolerance)
     if paths.modes is not None and len(laws) <= 2 and all(law.code is not None for law in laws):
-        D, G, sound = _march(paths, record, laws)
+        D, G, sound = march_laws(paths, record, laws, start if paths.periodic else None)
         if sound:
             return D, G, "ok"
     turns = max(most // 3, 4)
@@ -205,54 +56,10 @@ def _status(error: float, tolerance: float) -> str:
     return "ok" if error < 30 * tolerance else "not converged"
 
 
-def _march(paths: Bed, record: int, laws: tuple[LawAlong, ...], passes: int = 4) -> tuple[Complex, Complex, bool]:
-    """Motion, force and whether they are sound, from a march in the order of time: a burst once, a period until it closes on itself."""
-    from bayes_nlsid.simulation.modal_march import march_modes
-
-    steps, linear = paths.steps, paths.linear(record)
-    n = MARCHED * paths.samples
-    decay = np.exp(np.arange(n) / MARCHED * np.log(paths.window[1]))    # 1 for periodic records
-    rows = np.ascontiguousarray(linear.T)
-    q0, v0 = (np.ascontiguousarray((np.fft.irfft(x, n, axis=1, norm="forward") / decay).T) for x in (rows, paths.s * rows))
-    codes, powers = (np.array([law.code[k] for law in laws if law.code is not None]) for k in (0, 1))
-    values = np.zeros((len(laws), max(max(len(law.values) for law in laws), 1)))
-    for j, law in enumerate(laws):
-        values[j, :len(law.values)] = law.values
-    g, state, before = np.zeros((n, len(laws))), np.zeros((2, steps.b.shape[1])), np.zeros(len(laws))
-    kept: Array = np.zeros(0)
-    lost, closed = 0, not paths.periodic
-    for _ in range(passes if paths.periodic else 1):
-        lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, codes, powers, values, g, state, before)
-        G = np.asarray(np.fft.rfft(g * decay[:, None], axis=0, norm="forward")[:len(paths.s)])
-        if not paths.periodic or not np.isfinite(g).all():
-            break
-        change = float(np.abs(g - kept).max() / max(float(np.abs(g).max()), 1e-300)) if len(kept) else 1.0
-        closed = change < 0.05
-        if change < 1e-3:
-            break
-        kept, before = g.copy(), g[-1].copy()
-        # the state at the start of a period that these forces would make steady; one step back, where the march takes it up
-        X = (G @ steps.b) * steps.back
-        state = np.stack([_first(X), _first(paths.s[:, None] * X)])
-    D = linear - _mul(paths.among, G)
-    return D, G, bool(np.isfinite(g).all() and closed and lost < 1e-3 * n)
-
-
-def _first(lines: Complex) -> Array:
-    """Value in time at t = 0 of spectra (K, m) of real signals."""
-    return np.asarray(lines[0].real + 2 * lines[1:].real.sum(axis=0))
-
-
 def _rest(paths: Bed, linear: Complex, D: Complex, laws: tuple[LawAlong, ...]) -> tuple[Complex, Complex, Array, Array, Array]:
     """Residual of the fixed point, force spectrum, and motion and force in time."""
-    d, v = paths.in_time(D)
-    g = np.stack([law.force(d[:, j], v[:, j], paths.dt) for j, law in enumerate(laws)], axis=1)
-    G = paths.to_lines(g)
-    return linear - _mul(paths.among, G) - D, G, d, v, g
-
-
-def _mul(matrix: Complex, vector: Complex) -> Complex:
-    return np.asarray(matrix[:, :, 0] * vector if vector.shape[1] == 1 else (matrix @ vector[:, :, None])[:, :, 0])
+    G, d, v, g = forces_along(paths, D, laws)
+    return linear - through(paths.among, G) - D, G, d, v, g
 
 
 def _preconditioner(paths: Bed, d: Array, v: Array, g: Array) -> Complex:
@@ -290,9 +97,9 @@ def _newton(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex 
                 force = damp * paths.wave(paths.s * rows) + (stiff * paths.wave(rows) if bent else 0.0)
             else:
                 force = stiff * paths.wave(rows)
-            return _mul(inverse, x + _mul(paths.among, paths.to_lines(force)))
+            return through(inverse, x + through(paths.among, paths.to_lines(force)))
 
-        step = gmres(apply, _mul(inverse, rest), 40, max(0.02, 0.1 * tolerance / float(error)))
+        step = gmres(apply, through(inverse, rest), 40, max(0.02, 0.1 * tolerance / float(error)))
         length, accepted = 1.0, False
         for _ in range(6):
             trial = _rest(paths, linear, D + length * step, laws)
@@ -331,17 +138,17 @@ def _sweep(paths: Bed, record: int, laws: tuple[LawAlong, ...], window: int = 38
             here = slice(first, min(first + window, n))
             old, w = g[here].copy(), min(window, n - first)
             padded = np.fft.rfft(np.concatenate([old, np.zeros((2 * window - w, J))]), axis=0)
-            own = [np.fft.irfft(_mul(k, padded), 2 * window, axis=0)[:w] for k in short]
+            own = [np.fft.irfft(through(k, padded), 2 * window, axis=0)[:w] for k in short]
             solve_window(d[here] + own[0], v[here] + own[1], *near, tables, reach, g[here], np.zeros((J, w)))
             step = np.zeros((n, J))
             step[here] = g[here] - old
             spectrum = np.fft.rfft(step, axis=0)
-            d = d - np.fft.irfft(_mul(spectra[0], spectrum), n, axis=0)
-            v = v - np.fft.irfft(_mul(spectra[1], spectrum), n, axis=0)
+            d = d - np.fft.irfft(through(spectra[0], spectrum), n, axis=0)
+            v = v - np.fft.irfft(through(spectra[1], spectrum), n, axis=0)
         change = float(np.abs(g - before).max())
         if not 1e-4 * float(np.abs(g).max()) < change < np.inf:
             break
-    found = paths.linear(record) - _mul(paths.among, paths.to_lines(g))
+    found = paths.linear(record) - through(paths.among, paths.to_lines(g))
     sound = np.isfinite(found).all() and np.abs(found).max() < 10 * np.abs(paths.linear(record)).max()
     return found if sound else paths.linear(record)
 
@@ -383,7 +190,7 @@ def _relax(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex |
             inverse = _preconditioner(paths, d, v, g)
             states, steps = [], []
         states.append(D)
-        steps.append(_mul(inverse, rest))
+        steps.append(through(inverse, rest))
         D = _anderson(states[-depth:], steps[-depth:])
     return kept[0], kept[1], float(best)
 

@@ -24,7 +24,8 @@ from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
-from bayes_nlsid.mismatch.motion import Bed, LawAlong, bed, settle
+from bayes_nlsid.mismatch.motion import settle
+from bayes_nlsid.mismatch.paths import Bed, LawAlong, bed
 from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
 Array = NDArray[np.float64]
