@@ -10,6 +10,7 @@ from studies.virtual_beam import beam
 from studies.virtual_beam.beam import SLIP, Array
 
 import bayes_nlsid as nl
+from bayes_nlsid.inference.likelihood import whittle_variance
 from bayes_nlsid.recordings.kinematics import kinematics
 from bayes_nlsid.recordings.noise import NoiseFloor
 from bayes_nlsid.recordings.recording import Channel, Recording
@@ -179,18 +180,60 @@ class Fitted:
         return values_of(self.fit.theta)
 
 
+SETTLED = 1e-3
+
+
+def common_law(model: ModalModel, data: ModalData, windows: dict[str, tuple[float, float]], *, rounds: int, starts: int,
+               seed: int) -> tuple[nl.Fit, float]:
+    """One Iwan law for all joints, equation of mode 1, the joints' flexibility put back anew in each round: a start that converges.
+
+    Ends when a round changes the joints' forces by less than ``SETTLED`` (rms); also returns the last change.
+    """
+    sensing, found, force, change = Sensing(model), None, np.zeros_like(data.q), np.inf
+    for i in range(rounds):
+        own = sensing.corrected(data, force) if i else data
+        found = nl.fit(problem(model, windowed(own, windows), "S2", iwan(tied=True)), starts=starts if i == 0 else 3, seed=seed,
+                       warm=None if found is None else found.theta)
+        new = sensing.force_of(data, common_values(found.theta))
+        change = float(np.sqrt(np.mean((new - force) ** 2) / np.mean(new**2)))
+        # Each step overshoots: the mean of both settles in half the rounds.
+        force = new if i == 0 else 0.5 * (force + new)
+        if change < SETTLED:
+            break
+    assert found is not None
+    return found, change
+
+
+def common_values(theta: Array) -> Array:
+    """(J, 4) from theta (5,) of the common law."""
+    return np.tile([theta[2], beam.K_T, theta[3], theta[4]], (len(SLIP), 1))
+
+
 def fit_scenario(model: ModalModel, data: ModalData, windows: dict[str, tuple[float, float]], name: str, *, starts: int, seed: int,
                  rounds: int = 0, first: Array | None = None) -> Fitted:
-    """Fit S1, S2 or S3; with ``rounds`` the joints' own flexibility is put back between fits, beginning with the law ``first``."""
+    """Fit S1, S2 or S3.
+
+    Parameters
+    ----------
+    rounds : int
+        How often the joints' own flexibility is put back with the law found so far and the fit repeated; 0 does as the paper does.
+    first : ndarray (5,), optional
+        Theta of the common law, from which the first round starts.
+    """
     sensing = Sensing(model)
-    found, own = None, data
-    for i in range(max(1, rounds)):
+    warm = None if first is None else np.concatenate([first[:2], np.tile(first[2:], len(SLIP))])
+    own, weights = data, None
+    for _ in range(max(1, rounds)):
         if rounds:
-            law = first if found is None else values_of(found.theta)
-            assert law is not None
-            own = sensing.corrected(data, law)
+            assert warm is not None
+            own = sensing.corrected(data, sensing.force_of(data, values_of(warm)))
         cut = windowed(own, windows)
-        found = nl.fit(problem(model, cut, name), starts=starts if i == 0 else max(2, starts // 4), seed=seed,
-                       warm=None if found is None else found.theta)
-    assert found is not None
+        asked = problem(model, cut, name)
+        if name == "S3":
+            # Equations of high modes hold errors of the model far above sensor noise: weigh each by the spectrum of what it leaves.
+            if warm is None:
+                warm = nl.fit(asked, starts=starts, seed=seed).theta
+            weights = 1 / whittle_variance(asked, warm)
+        found = nl.fit(asked, starts=starts if warm is None else 3, seed=seed, warm=warm, weights=weights)
+        warm = found.theta
     return Fitted(name + (" with joint flexibility" if rounds else ""), found, cut, rounds)

@@ -45,8 +45,8 @@ def frequencies(book: Book, solid: Solid) -> None:
 def reductions(book: Book, solid: Solid) -> dict[str, Reduced]:
     """ROM1 by iterations, ROM2 from twelve points, and what each basis loses at the joints."""
     structure = solid.structure
-    rom1 = iirs(structure, MASTERS, iterations=book.settings.pick(10, 3), tolerance=1e-9)
-    rom2 = iirs(structure, MASTERS[:12], iterations=book.settings.pick(20, 5), tolerance=1e-9, guard="constrain")
+    rom1 = iirs(structure, MASTERS, iterations=book.settings.pick(6, 3), tolerance=1e-9)
+    rom2 = iirs(structure, MASTERS[:12], iterations=book.settings.pick(15, 5), tolerance=1e-9, guard="constrain")
     found = {"ROM1": iirs(structure, MASTERS, iterations=1, tolerance=1e-9), "ROM1, all iterations": rom1, "ROM2": rom2,
              "SEREP": serep(structure, MASTERS, 13), "Craig-Bampton": craig_bampton(structure, MASTERS, 20),
              "modes": attachment_modes(structure, 12, at=()), "attachment": attachment_modes(structure, 12, at=SLIP, rigid=False)}

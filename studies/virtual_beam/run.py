@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 
-from studies.virtual_beam import linear_steps
+from studies.virtual_beam import linear_steps, nonlinear_steps, prediction_steps
 from studies.virtual_beam.study import Book, Settings, solid_of
 from studies.virtual_beam.table import write
 
@@ -20,9 +20,32 @@ def run(settings: Settings) -> Book:
     with book.step("frequencies (Table 2)"):
         linear_steps.frequencies(book, solid)
     with book.step("reductions (Table 2, Fig. 4)"):
-        linear_steps.reductions(book, solid)
+        reduced = linear_steps.reductions(book, solid)
     with book.step("updating (Tables 5, 6)"):
         linear_steps.updating(book, solid)
+    with book.step("backbones (Fig. 5)"):
+        models = nonlinear_steps.models_of(solid, reduced)
+        nonlinear_steps.backbones(book, models)
+    with book.step("check of the algebra"):
+        nonlinear_steps.algebra(book, models)
+    with book.step("virtual tests (Fig. 6)"):
+        recorded = nonlinear_steps.record(book, models)
+    with book.step("virtual sensing (Fig. 6)"):
+        law = nonlinear_steps.sensing(book, models, recorded)
+    with book.step("fits (Tables 3, 4)"):
+        found = nonlinear_steps.fits(book, models, recorded, law)
+    with book.step("posteriors (Table 4)"):
+        posteriors = nonlinear_steps.posteriors(book, found)
+    with book.step("force maps (Fig. 7)"):
+        nonlinear_steps.force_maps(book, models, recorded, found, posteriors)
+    with book.step("Monte Carlo (Fig. 8)"):
+        prediction_steps.monte_carlo(book, models, posteriors)
+    with book.step("selection (Fig. 9)"):
+        prediction_steps.selection(book, models, found)
+    with book.step("validation (Fig. 10)"):
+        prediction_steps.validation(book, models, recorded, posteriors)
+    with book.step("response curves (Fig. 16)"):
+        prediction_steps.responses(book, models, posteriors["S3"])
     total = time.perf_counter() - start
     book.notes.append(f"{'Fast variant (coarse mesh): numbers have the tolerances of tests/studies. ' if settings.fast else ''}"
                       f"Seed {settings.seed}; {total:.0f} s: " + ", ".join(f"{k} {v:.0f}" for k, v in book.seconds.items()))

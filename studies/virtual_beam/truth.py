@@ -7,8 +7,8 @@ no modal filter with few modes can see.
     u̇̇ + 2 ζ ω u̇ + ω² u = φ_F F − Bᵀ g(q),      q = B u − G_jj g + G_jF F,      x = S u − G_sj g + G_sF F
 
 g is the joints' force less that of the stuck spring, which the modes hold already. Modes are carried forward exactly over each step
-under forces that change linearly; g at its end follows from five equations (Newton). The free-free beam does not drift: as in
-the paper, rigid-body motion has been taken out (Eq. 15-18).
+under forces that follow the parabola through the step's ends and the point before; g at its end follows from five equations (Newton).
+The free-free beam does not drift: as in the paper, rigid-body motion has been taken out (Eq. 15-18).
 """
 
 from __future__ import annotations
@@ -154,17 +154,18 @@ def integrate(plant: Plant, law: Static | Memory, force: Array, h: float, *, u0:
     H = (B * e.u1) @ B.T + plant.G_jj
     forward, back = _maps(plant, e)
     eye, J = np.eye(len(B)), len(B)
-    state = np.zeros((R, 2 * m + J + 2))         # u, v, g, F now, F next
+    now = slice(2 * m, 2 * m + J)
+    state = np.zeros((R, 2 * m + 2 * J + 3))         # u, v, g now, g before, F before, now, next
     state[:, :m] = 0.0 if u0 is None else u0
     q = _solve(law, state[:, :m] @ B.T, plant.G_jj, eye, state[:, :m] @ B.T)[0]
-    state[:, 2 * m:-2] = law.force(q)[0]
+    state[:, now] = state[:, 2 * m + J:-3] = law.force(q)[0]
     law.commit(q)
     kept = -(-n // keep)
     states, qs = np.empty((kept, R, 2 * m + J)), np.empty((kept, R, J))
-    states[0], qs[0] = state[:, :-2], q
+    states[0], qs[0] = state[:, :now.stop], q
     first, second, worst = q, q, 0.0
     for i in range(1, n):
-        state[:, -2], state[:, -1] = force[i - 1], force[i]
+        state[:, -3], state[:, -2], state[:, -1] = force[max(i - 2, 0)], force[i - 1], force[i]
         ahead = state @ forward
         guess = 3 * (q - first) + second
         first, second = q, first
@@ -173,9 +174,9 @@ def integrate(plant: Plant, law: Static | Memory, force: Array, h: float, *, u0:
         g = law.force(q)[0]
         law.commit(q)
         state[:, :2 * m] = ahead[:, :2 * m] - g @ back
-        state[:, 2 * m:-2] = g
+        state[:, now.stop:-3], state[:, now] = state[:, now], g
         if i % keep == 0:
-            states[i // keep], qs[i // keep] = state[:, :-2], q
+            states[i // keep], qs[i // keep] = state[:, :now.stop], q
         if progress is not None and i % 65536 == 0:
             progress(f"plant: {i / n:.0%}")
     u, v, g, F = states[..., :m], states[..., m:2 * m], states[..., 2 * m:], force[::keep][..., None]
@@ -186,14 +187,15 @@ def integrate(plant: Plant, law: Static | Memory, force: Array, h: float, *, u0:
 
 
 def _maps(plant: Plant, e: _Step) -> tuple[Array, Array]:
-    """(2m + J + 2, 2m + J): what the present state and the forces give, the joints' next force left out; (J, 2m): what that force takes."""
+    """(2m + 2J + 3, 2m + J): what the present state and the forces give without the joints' next force; (J, 2m): what that force takes."""
     B, m, J = plant.joints, len(plant.omega), len(plant.joints)
-    forward = np.zeros((2 * m + J + 2, 2 * m + J))
+    forward = np.zeros((2 * m + 2 * J + 3, 2 * m + J))
     forward[:m, :m], forward[m:2 * m, :m] = np.diag(e.uu), np.diag(e.uv)
     forward[:m, m:2 * m], forward[m:2 * m, m:2 * m] = np.diag(e.vu), np.diag(e.vv)
-    forward[2 * m:-2, :m], forward[2 * m:-2, m:2 * m] = -B * e.u0, -B * e.v0
-    forward[-2, :m], forward[-2, m:2 * m] = plant.shaker * e.u0, plant.shaker * e.v0
-    forward[-1, :m], forward[-1, m:2 * m] = plant.shaker * e.u1, plant.shaker * e.v1
+    for k, rows in enumerate((slice(2 * m, 2 * m + J), slice(2 * m + J, -3))):
+        forward[rows, :m], forward[rows, m:2 * m] = -B * (e.u0, e.ub)[k], -B * (e.v0, e.vb)[k]
+    for k, row in enumerate((-3, -2, -1)):
+        forward[row, :m], forward[row, m:2 * m] = plant.shaker * (e.ub, e.u0, e.u1)[k], plant.shaker * (e.vb, e.v0, e.v1)[k]
     forward[:, 2 * m:] = forward[:, :m] @ B.T
     forward[-1, 2 * m:] += plant.G_jf
     return forward, np.hstack([B * e.u1, B * e.v1])
@@ -218,14 +220,16 @@ def _solve(law: Static | Memory, aim: Array, H: Array, eye: Array, guess: Array)
 
 @dataclass(frozen=True)
 class _Step:
-    """One exact step of damped oscillators under a force that changes linearly from p0 to p1."""
+    """One exact step of damped oscillators under a force on the parabola through its values before (b), now (0) and next (1)."""
 
     uu: Array
     uv: Array
     vu: Array
     vv: Array
+    ub: Array
     u0: Array
     u1: Array
+    vb: Array
     v0: Array
     v1: Array
 
@@ -233,15 +237,16 @@ class _Step:
 def _exact(omega: Array, zeta: Array, h: float) -> _Step:
     from scipy.linalg import expm
 
-    out = np.empty((8, len(omega)))
+    out = np.empty((10, len(omega)))
     for k, (w, z) in enumerate(zip(omega, zeta, strict=True)):
-        # states: u, v, force, change of force per step; scaled by w so that the exponential is well conditioned
-        A = np.zeros((4, 4))
+        # states: wu, v, force/w and its first and second change per step, so that the exponential is well conditioned
+        A = np.zeros((5, 5))
         A[0, 1], A[1, 0], A[1, 1] = w * h, -w * h, -2 * z * w * h
-        A[1, 2], A[2, 3] = w * h, 1.0
+        A[1, 2], A[2, 3], A[3, 4] = w * h, 1.0, 1.0
         E = expm(A)
-        out[:, k] = (E[0, 0], E[0, 1] / w, E[1, 0] * w, E[1, 1], (E[0, 2] - E[0, 3]) / w**2, E[0, 3] / w**2, (E[1, 2] - E[1, 3]) / w,
-                     E[1, 3] / w)
+        before, now, after = -E[:2, 3] / 2 + E[:2, 4], E[:2, 2] - 2 * E[:2, 4], E[:2, 3] / 2 + E[:2, 4]
+        out[:, k] = (E[0, 0], E[0, 1] / w, E[1, 0] * w, E[1, 1], *(x[0] / w**2 for x in (before, now, after)),
+                     *(x[1] / w for x in (before, now, after)))
     return _Step(*out)
 
 

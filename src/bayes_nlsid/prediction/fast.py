@@ -26,7 +26,7 @@ Complex = NDArray[np.complex128]
 HARMONICS = np.array([1, 3, 5])
 POINTS = 16
 INNER = 24
-ROUNDS = 5
+ROUNDS = 40   # five do where the modes are few; the flexibility of a joint that many modes carry needs twenty
 CONVERGED = 1e-6
 INTERACTION = 0.02
 """Share of kinetic energy outside the first harmonic of the mode beyond which one mode alone is not the motion."""
