@@ -95,7 +95,7 @@ def best_drive(linear: Linear, trials: Sequence[Trial], forces: Sequence[Array])
     """
     longest = max(range(len(trials)), key=lambda i: trials[i].recording.n * trials[i].level)
     trial = trials[longest]
-    some = min(trial.recording.n, 6000)
+    some = min(trial.recording.n, max(1500, 12_000 // max(2, linear.model.modes)))
     short = replace(trial, recording=replace(trial.recording.window(0.0, some * trial.recording.dt), period=None))
     force = forces[longest][:some]
     share = np.ones(linear.model.modes) * _modal_scale(linear, short) ** 2

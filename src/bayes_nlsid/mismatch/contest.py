@@ -23,6 +23,7 @@ from bayes_nlsid.mismatch.weigh import Weighed, searched, spread
 
 Array = NDArray[np.float64]
 ITERATIONS = 12
+WIDE = 24       # channels times modes
 LAWS = 3        # of one class that are tried
 CHARGE = 0.01   # of the logarithm of squared error, for each parameter of a law
 PLACES, NEAR = 2, 0.3   # other places at which the leading class is tried, and how much less they may gain on the bench
@@ -87,7 +88,7 @@ def enter(campaign: Campaign, bench: Bench, weighed: Weighed) -> Entrant:
 def enter_linear(campaign: Campaign, linear: Linear, drive: Drive) -> Entrant:
     """Estimate the linear model by simulation, to the end."""
     model = extended(linear, (), (), [t.recording for t in campaign.trials], push=_push(campaign))
-    return _entrant(campaign, None, *estimate(linear, drive, campaign, model, 3 * ITERATIONS))
+    return _entrant(campaign, None, *estimate(linear, drive, campaign, model, 2 * ITERATIONS))
 
 
 def _entrant(campaign: Campaign, weighed: Weighed | None, model: Extended, waves: Sequence[Array]) -> Entrant:
@@ -118,7 +119,7 @@ def champion(campaign: Campaign, bench: Bench, tuned: Entrant, weighed: Weighed)
     """
     level = np.inf if tuned.failed else float(tuned.blocks.mean())
     kept: Entrant | None = None
-    for w in sorted((weighed, *weighed.others[:LAWS - 1]), key=lambda w: (_shapes(w), -w.gain)):
+    for w in sorted((weighed, *weighed.others[:(1 if _wide(campaign, bench) else LAWS) - 1]), key=lambda w: (_shapes(w), -w.gain)):
         tried = enter(campaign, bench, w)
         if tried.failed or float(tried.blocks.mean()) < level:
             tried = polished(campaign, bench, tried)
@@ -126,6 +127,11 @@ def champion(campaign: Campaign, bench: Bench, tuned: Entrant, weighed: Weighed)
             kept = tried
     assert kept is not None
     return kept
+
+
+def _wide(campaign: Campaign, bench: Bench) -> bool:
+    """Whether there are so many channels and modes that few hypotheses can be simulated."""
+    return bench.linear.model.modes * max(len(t.recording.channels) for t in campaign.used("fit")) > WIDE
 
 
 def _shapes(w: Weighed) -> int:
@@ -164,7 +170,7 @@ def hold(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequence[Wei
                     key=lambda w: -odds.get(w.key, 0.0))
     chosen: list[Weighed] = []
     for w in ranked:
-        if len(chosen) < RIVALS and all(classes(w) != classes(other) for other in chosen):
+        if len(chosen) < (3 if _wide(campaign, bench) else RIVALS) and all(classes(w) != classes(other) for other in chosen):
             chosen.append(w)
     for w in [w for w in chosen if len(w.key) > 1]:
         members = [m for m in singles if m.key[0] in w.key and modelled(m)]
@@ -187,7 +193,7 @@ def _elsewhere(campaign: Campaign, bench: Bench, tuned: Entrant, singles: Sequen
     own = best.weighed
     near = [w for w in singles if classes(w) == classes(own) and w.key != own.key and modelled(w)
             and own.gain - w.gain < NEAR * abs(own.gain) + 3 * spread(own.blocks - w.blocks) + 10.0]
-    return [champion(campaign, bench, tuned, w) for w in near[:PLACES]]
+    return [champion(campaign, bench, tuned, w) for w in near[:1 if _wide(campaign, bench) else PLACES]]
 
 
 def classes(w: Weighed) -> frozenset[str]:

@@ -32,6 +32,7 @@ EVEN = 0.05          # share of the local rms that counts as error beside the no
 START_CYCLES = 6     # of the slowest mode, from which an unknown start is estimated; not scored
 AT_REST = 0.03
 SAMPLES = 12_000     # of all records that a re-estimation simulates
+WORK = 300_000       # the same times channels and modes
 SHIFT = 1e-5
 FREQUENCIES = (0.6, 1.6)   # of the linear part beside a law, over those as delivered and those of the best linear model
 DAMPING = (0.03, 30.0)
@@ -242,7 +243,8 @@ def estimate(linear: Linear, drive: Drive, campaign: Campaign, ext: Extended, it
         Simulated channels of the fitted records.
     """
     trials = simulated(campaign)
-    most = max(1500, SAMPLES // len(trials))
+    wide = max(len(t.recording.channels) for t in trials) * linear.model.modes
+    most = max(1500, min(SAMPLES, WORK // wide) // len(trials))
     try:
         tasks = [task_of(linear, drive, t, ext, most) for t in trials]
     except (ValueError, np.linalg.LinAlgError) as error:

@@ -27,6 +27,7 @@ Complex = NDArray[np.complex128]
 BLOCKS = 24           # blocks of time, all fitted records together
 LEAST_CYCLES = 4      # of the slowest elastic mode in a block
 PREWHITEN = 16        # order of the autoregression
+FEW = 64              # columns of the linear space up to which it is laid out by singular values
 TAPS = 3              # samples by which an input chain may smear a force to either side
 
 
@@ -253,12 +254,22 @@ def _assemble(linear: Linear, desks: Sequence[Desk], taps: bool, drive: Drive) -
     matrix, prior = matrix[:, keep], prior[keep]
     names = [n for n, k in zip(names, keep, strict=True) if k]
     # a column with a prior of its own may only take what the prior allows: rows of the prior below the data
-    sd = np.where(np.isfinite(prior), prior, 1e6 / norm[keep])
-    tall = np.concatenate([matrix * sd, np.eye(matrix.shape[1])])
-    left, values, right = np.linalg.svd(tall, full_matrices=False)
-    basis = left[:len(matrix), values > 1e-7 * values[0]]
-    target = np.concatenate([e, np.zeros(matrix.shape[1])])
-    coefficients = sd * (right.T @ ((left.T @ target) / values))
+    if matrix.shape[1] <= FEW:
+        sd = np.where(np.isfinite(prior), prior, 1e6 / norm[keep])
+        tall = np.concatenate([matrix * sd, np.eye(matrix.shape[1])])
+        left, values, right = np.linalg.svd(tall, full_matrices=False)
+        basis, vectors = left[:len(matrix), values > 1e-7 * values[0]], right.T
+        inner = left[:len(matrix)].T @ e
+    else:
+        # by the normal matrix, since there are hundreds of columns where there are many channels and modes; the rows of the prior keep its
+        # smallest eigenvalue at one
+        sd = np.where(np.isfinite(prior), prior, 1e4 / norm[keep])
+        scaled = matrix * sd
+        squares, vectors = np.linalg.eigh(scaled.T @ scaled + np.eye(matrix.shape[1]))
+        values = np.sqrt(squares)
+        basis = scaled @ (vectors / values)
+        inner = basis.T @ e
+    coefficients = sd * (vectors @ (inner / values))
     block = _blocks(linear, desks)
     part = np.concatenate([np.full((d.n - d.skip) * len(d.trial.recording.channels), d.part) for d in desks])
     return Bench(linear, tuple(desks), e, np.ascontiguousarray(basis), block,
