@@ -60,7 +60,7 @@ def needs_general(path: str | Path) -> bool:
     if not isinstance(meta.get("band_hz"), list):
         return True
     period, rate = float(meta.get("period_s") or 0.0), float(meta.get("fs_hz") or 0.0)
-    steady = 0
+    steady, bursts = 0, 0
     for entry in meta["records"]:
         name = str(entry.get("name", "")) if isinstance(entry, dict) else ""
         file = folder / f"{name}.npz"
@@ -81,7 +81,8 @@ def needs_general(path: str | Path) -> bool:
         steady += kind == "steady" and _repeats(force, round(period * rate))
         if kind == "burst" and _under_way(force):
             return True   # neither periodic nor from rest to rest
-    return steady == 0
+        bursts += kind == "burst"
+    return steady == 0 and bursts < 2
 
 
 def _repeats(force: Array, block: int) -> bool:
