@@ -96,7 +96,7 @@ def validation(book: Book, models: Models, recorded: Recorded, posteriors: dict[
     for record, floor in zip(recorded.records[1:], recorded.floors[1:], strict=True):
         for name, posterior in posteriors.items():
             linear = models.twelve if name == "S1" else models.rich
-            judged = nl.heldout(models.law(linear), posterior.draws(book.settings.pick(30, 10), book.settings.seed), record,
+            judged = nl.heldout(models.law(linear), posterior.draws(book.settings.pick(20, 5), book.settings.seed), record,
                                 band=analyst.BAND, noise=floor, start="rest")
             shown[record.name, name] = judged
             book.add(part, f"{record.name}, {name}", "", f"error {100 * judged.nrmse:.2f} % of rms (sensor noise "

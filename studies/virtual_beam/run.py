@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import time
-
 from studies.virtual_beam import linear_steps, nonlinear_steps, prediction_steps
 from studies.virtual_beam.study import Book, Settings, solid_of
-from studies.virtual_beam.table import write
 
 
 def run(settings: Settings) -> Book:
     """Everything; figures, ``table.md`` and ``numbers.json`` go to ``settings.out``."""
-    start = time.perf_counter()
     settings.out.mkdir(parents=True, exist_ok=True)
     book = Book(settings)
     with book.step("solid model"):
@@ -46,9 +41,4 @@ def run(settings: Settings) -> Book:
         prediction_steps.validation(book, models, recorded, posteriors)
     with book.step("response curves (Fig. 16)"):
         prediction_steps.responses(book, models, posteriors["S3"])
-    total = time.perf_counter() - start
-    book.notes.append(f"{'Fast variant (coarse mesh): numbers have the tolerances of tests/studies. ' if settings.fast else ''}"
-                      f"Seed {settings.seed}; {total:.0f} s: " + ", ".join(f"{k} {v:.0f}" for k, v in book.seconds.items()))
-    write(book.rows, book.notes, settings.out / "table.md")
-    (settings.out / "numbers.json").write_text(json.dumps(book.numbers, indent=1) + "\n", encoding="utf-8")
     return book

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from studies.virtual_beam import beam
 from studies.virtual_beam.beam import Solid
-from studies.virtual_beam.table import Row
+from studies.virtual_beam.table import Row, write
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,15 @@ class Book:
         yield
         self.seconds[name] = time.perf_counter() - start
         print(f"{name}: {self.seconds[name]:.1f} s", flush=True)
+        self.save()
+
+    def save(self) -> None:
+        """Write ``table.md`` and ``numbers.json`` as far as they go."""
+        kind = "Fast variant: coarse mesh, short sweep, few starts and draws. " if self.settings.fast else ""
+        took = ", ".join(f"{k} {v:.0f}" for k, v in self.seconds.items())
+        own = f"{kind}Seed {self.settings.seed}; {sum(self.seconds.values()):.0f} s in all: {took}."
+        write(self.rows, [own, *self.notes], self.settings.out / "table.md")
+        (self.settings.out / "numbers.json").write_text(json.dumps(self.numbers, indent=1) + "\n", encoding="utf-8")
 
 
 def solid_of(settings: Settings) -> Solid:

@@ -185,8 +185,9 @@ def _substeps(source: _Source, theta: Array, start: tuple[Array | None, ...], to
     k, coarse = 1, run(1)
     while True:
         fine = run(2 * k)
-        size = np.sqrt(np.mean(np.square(fine), axis=0))
-        change = np.sqrt(np.mean(np.square(fine - coarse), axis=0))
+        with np.errstate(over="ignore", invalid="ignore"):      # steps too long for a stiff model overflow: then shorter ones are tried
+            size = np.sqrt(np.mean(np.square(fine), axis=0))
+            change = np.sqrt(np.mean(np.square(fine - coarse), axis=0))
         # second order: the error of the coarser run is 4/3 of the change
         error = float(4 / 3 * np.max(change / np.maximum(size, 1e-3 * size.max() + 1e-300))) if np.isfinite(change).all() else np.inf
         if error <= tolerance:
