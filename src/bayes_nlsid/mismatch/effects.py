@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.march import compiled_wanted, march
 from bayes_nlsid.forces.motion import force_along, motion
+from bayes_nlsid.forces.term import Term
 from bayes_nlsid.mismatch.calibrate import Chain, Extension
 from bayes_nlsid.mismatch.laws import Law
 from bayes_nlsid.mismatch.linear import Attachment, Family
+from bayes_nlsid.mismatch.paths import LawAlong
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -272,3 +276,58 @@ def extension(kinds: tuple[LinearKind, ...], channels: int) -> Extension | None:
 
     return Extension(np.concatenate([k.start for k in kinds]), parts, np.concatenate([k.sd for k in kinds]),
                      np.concatenate([k.centre for k in kinds]))
+
+
+def law_of(effect: Effect, time: float, periodic: bool) -> LawAlong:
+    """The force of an effect along a motion, in a record taken at ``time`` (−1 to 1 over the test day of the fitted records)."""
+    if effect.law is None:
+        stiffness = float(np.interp(time, effect.knots, effect.values))
+        return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))),
+                        _code(LIBRARY["spring"]), np.array([stiffness]))
+    force = partial(_along, effect, periodic)
+    if effect.law.term.memory != "none":
+        return LawAlong(force)
+    return LawAlong(force, partial(_slope, effect), _code(effect.law.term), np.asarray(effect.values, dtype=float))
+
+
+def _along(effect: Effect, periodic: bool, d: Array, v: Array, dt: float) -> Array:
+    assert effect.law is not None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return along_period(effect.law, effect.values, d, v, dt, periodic)
+
+
+def _slope(effect: Effect, d: Array, v: Array) -> tuple[Array, Array]:
+    assert effect.law is not None
+    with np.errstate(over="ignore", invalid="ignore"):
+        stiffness, damping = effect.law.term.slope(d, v, *effect.values)
+    return np.broadcast_to(stiffness, d.shape), np.broadcast_to(damping, d.shape)
+
+
+def _code(term: Term) -> tuple[int, float] | None:
+    """Number of a law for compiled code, where that is to be had."""
+    if not compiled_wanted():
+        return None
+    from bayes_nlsid.forces.compiled import law_code
+
+    return law_code(term)
+
+
+def weakened(effect: Effect, factor: float) -> Effect:
+    """The same effect with its force scaled."""
+    if effect.law is None:
+        return replace(effect, values=factor * effect.values)
+    values = np.array(effect.values, dtype=float)
+    values[list(effect.law.scaled)] *= factor
+    return replace(effect, values=values)
+
+
+def packed(effect: Effect, reference: Effect) -> Array:
+    """Search coordinates of ``effect`` on the scales of ``reference``."""
+    if effect.law is None:
+        return np.asarray(effect.values / max(float(np.abs(reference.values).max()), 1e-12))
+    out = pack(effect)
+    free = [i for i, kind in enumerate(effect.law.free) if kind != "fixed"]
+    for k, i in enumerate(free):
+        if effect.law.free[i] == "signed":
+            out[k] = effect.values[i] / max(abs(float(reference.values[i])), 1e-12)
+    return out

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import System, assemble, finish, floored, stack
-from bayes_nlsid.mismatch.effects import Effect, extension, unpack
+from bayes_nlsid.mismatch.effects import Effect, extension, packed, unpack
 from bayes_nlsid.mismatch.linear import solve
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import (
@@ -22,7 +22,6 @@ from bayes_nlsid.mismatch.polish import (
     Hypothesis,
     force_strengths,
     hypothesis,
-    packed,
     paths_to_sensors,
     simulate,
     widened,

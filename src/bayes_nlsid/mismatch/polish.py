@@ -15,22 +15,20 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.forces.library import LIBRARY
-from bayes_nlsid.forces.march import compiled_wanted
-from bayes_nlsid.forces.term import Term
 from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored, predict
-from bayes_nlsid.mismatch.effects import Effect, LinearKind, along_period, extension, linear_kind, pack, unpack
+from bayes_nlsid.mismatch.effects import Effect, LinearKind, extension, law_of, linear_kind, pack, packed, unpack, weakened
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
 from bayes_nlsid.mismatch.motion import settle
-from bayes_nlsid.mismatch.paths import Bed, LawAlong, bed
+from bayes_nlsid.mismatch.paths import Bed, bed
 from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 FAINT, FAINT_CHARGE = 0.01, 60.0  # change of response below which a linear effect is charged, and how much
+STARTS, WEAKER = 4, 0.5  # weaker starts that are tried, and by how much each is weaker than the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
 
@@ -90,40 +88,6 @@ class Hypothesis:
         ext = extension(self.kinds, channels)
         x = self.fit.x
         return lambda s: ((), None) if ext is None else ext.parts(x, s)
-
-
-def law_of(effect: Effect, time: float, periodic: bool) -> LawAlong:
-    """The force of an effect along a motion, in a record taken at ``time`` (−1 to 1 over the test day of the fitted records)."""
-    if effect.law is None:
-        stiffness = float(np.interp(time, effect.knots, effect.values))
-        return LawAlong(lambda d, v, dt: stiffness * d, lambda d, v: (np.full(len(d), stiffness), np.zeros(len(d))),
-                        _code(LIBRARY["spring"]), np.array([stiffness]))
-    force = partial(_along, effect, periodic)
-    if effect.law.term.memory != "none":
-        return LawAlong(force)
-    return LawAlong(force, partial(_slope, effect), _code(effect.law.term), np.asarray(effect.values, dtype=float))
-
-
-def _code(term: Term) -> tuple[int, float] | None:
-    """Number of a law for compiled code, where that is to be had."""
-    if not compiled_wanted():
-        return None
-    from bayes_nlsid.forces.compiled import law_code
-
-    return law_code(term)
-
-
-def _along(effect: Effect, periodic: bool, d: Array, v: Array, dt: float) -> Array:
-    assert effect.law is not None
-    with np.errstate(over="ignore", invalid="ignore"):
-        return along_period(effect.law, effect.values, d, v, dt, periodic)
-
-
-def _slope(effect: Effect, d: Array, v: Array) -> tuple[Array, Array]:
-    assert effect.law is not None
-    with np.errstate(over="ignore", invalid="ignore"):
-        stiffness, damping = effect.law.term.slope(d, v, *effect.values)
-    return np.broadcast_to(stiffness, d.shape), np.broadcast_to(damping, d.shape)
 
 
 def day(spectra: Spectra, starts: Array) -> Array:
@@ -373,6 +337,16 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     now = simulate(paths, spectra, forces, unique, warm)
     rest = data - response(now.lines)
     cost = float((np.abs(rest) ** 2).sum())
+    for _ in range(STARTS if warm is None else 0):
+        # the first search saw the law on the motion without it: a strong one moves its place less, or otherwise
+        weaker = tuple(weakened(e, WEAKER) for e in forces)
+        there = simulate(paths, spectra, weaker, unique, None)
+        left = data - response(there.lines)
+        less = float((np.abs(left) ** 2).sum())
+        if not less < cost:
+            break
+        forces, now, rest, cost = weaker, there, left, less
+        y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
     normal = np.eye(len(y))
     for _ in range(steps):
         columns = np.empty((len(y), *rest.shape), dtype=complex)
@@ -400,15 +374,3 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         if gain < 1e-3 * cost:
             break
     return effects_at(y), now.motions, damping, cost, normal, now.lines, h, now.status
-
-
-def packed(effect: Effect, reference: Effect) -> Array:
-    """Search coordinates of ``effect`` on the scales of ``reference``."""
-    if effect.law is None:
-        return np.asarray(effect.values / max(float(np.abs(reference.values).max()), 1e-12))
-    out = pack(effect)
-    free = [i for i, kind in enumerate(effect.law.free) if kind != "fixed"]
-    for k, i in enumerate(free):
-        if effect.law.free[i] == "signed":
-            out[k] = effect.values[i] / max(abs(float(reference.values[i])), 1e-12)
-    return out

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.case import Case, CaseRecord
+from bayes_nlsid.mismatch.effects import law_of
 from bayes_nlsid.mismatch.linear import Family, Modes, receptances, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import bed
-from bayes_nlsid.mismatch.polish import Hypothesis, day, law_of
+from bayes_nlsid.mismatch.polish import Hypothesis, day
 from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]

@@ -85,12 +85,19 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         starts = forced(bench.family, fit, bench.evidence, where, bench.sizes[where], 0.4)
         tried = sorted((estimate(bench, fit, (c,), rounds=1) for c in starts), key=lambda h: h.cost)[:2]
         singles = _better(singles, [estimate(bench, h.fit, _lead(h), rounds=3) for h in tried])
+    singles = _promising(bench, singles, short, none)
     singles = _again(bench, singles, places, none, say)
     singles = _finish_leaders(bench, singles, none)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
         doubles = _second(bench, singles[0], places, band, none - singles[0].cost)
+        before = singles[0]
+        singles = _better(singles, _members(bench, singles[0], doubles))
+        if singles[0] is not before:
+            say("a member of a pair leads alone: looking for a second effect beside it")
+            singles = _finish_leaders(bench, singles, none)
+            doubles = _better(doubles, _second(bench, singles[0], places, band, none - singles[0].cost))
     return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
 
 
@@ -167,6 +174,18 @@ def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: flo
     return singles
 
 
+def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], none: float, most: int = 3) -> list[Hypothesis]:
+    """Joint iterations for the laws that promised most in the first search, where much is left: alternating estimation of a strong law
+    may end far from its optimum, behind a law of the wrong class that happened to begin well."""
+    if not singles or none - singles[0].cost < 200 or not _poor(bench, singles[0]):
+        return singles
+    promised = {c.effect.key: c.gain for c in short}
+    limit = 0.5 * (none - singles[0].cost)
+    worth = [h for h in singles if h.forces and len(h.effects) == 1 and promised.get(h.effects[0].key, 0.0) > limit]
+    order = sorted(worth, key=lambda h: -max(promised[h.effects[0].key], none - h.cost))
+    return _better(singles, [refine(bench, h, steps=6) for h in order[:most]])
+
+
 def _poor(bench: Bench, h: Hypothesis) -> bool:
     return h.misfit_records > 1.02 * bench.evidence.values or h.fit.cost > 1.1 * h.fit.dof
 
@@ -204,6 +223,19 @@ def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[floa
             pair = (c, *lead)
         out.append(estimate(bench, start, pair, rounds=3))
     return sorted(out, key=lambda h: h.cost)
+
+
+def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis]) -> list[Hypothesis]:
+    """Members of the best pairs, each alone from where the pair has left it: what leads may lead only because its rival began badly."""
+    out: dict[tuple[str, str], Hypothesis] = {}
+    for pair in sorted(doubles, key=lambda h: h.cost)[:2]:
+        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof):
+            break
+        for candidate in _lead(pair):
+            key = candidate.effect.key
+            if key not in out and key != lead.effects[0].key:
+                out[key] = estimate(bench, pair.fit, (candidate,), rounds=3)
+    return list(out.values())
 
 
 def _lead(first: Hypothesis) -> tuple[Candidate, ...]:
