@@ -12,14 +12,20 @@ from bayes_nlsid.mismatch.probability import BY_HAND, FEATURES, Layer, Scores, f
 
 
 def gather(results: Path, answers: Path) -> tuple[list[Scores], list[tuple[tuple[str, str], ...]]]:
-    """Scores and true keys of all cases that have both."""
+    """Scores and true keys of all cases that have both.
+
+    A case whose effect the search did not even propose, although the catalogue has it, teaches nothing about how to weigh what was proposed:
+    it is left out. (What is outside the catalogue is: it counts as ``other``.)
+    """
     scores, truths = [], []
     for file in sorted(results.glob("*/scores.json")):
         sheet = answers / f"{file.parent.name}.json"
         if sheet.exists():
             effects = json.loads(sheet.read_text())["effects"]
-            scores.append(scores_from(json.loads(file.read_text())))
-            truths.append(tuple(sorted((e["cls"], e["loc"]) for e in effects)))
+            one, truth = scores_from(json.loads(file.read_text())), tuple(sorted((e["cls"], e["loc"]) for e in effects))
+            if truth in {(), *(i.key for i in one.items)} or any(cls == "other" for cls, _ in truth):
+                scores.append(one)
+                truths.append(truth)
     return scores, truths
 
 

@@ -36,13 +36,6 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
     notes = list(analysis.notes)
     if proof.withdrawn:
         notes.append("The named effect made a held-out record worse and was withdrawn from the predictions.")
-    if p_mismatch > 0.5 and best is not None and _linear_only(best) and (proof.withdrawn or proof.elpd < 2.5 * proof.elpd_se):
-        # a linear effect may be named only if the never-fitted record improves
-        kept = odds.get((), 0.0)
-        factor = 0.15 if proof.updated < 1.1 * proof.noise else 0.5
-        odds = {k: (v * factor if k else 1 - factor * (1 - kept)) for k, v in odds.items()}
-        notes.append("The record that was not fitted does not improve: no linear effect is claimed.")
-        p_mismatch = 1 - odds.get((), 0.0)
     hypotheses = _named(analysis, odds, seed)
     verdict = "mismatch" if p_mismatch > 0.5 else "none"
     top = hypotheses[0]
@@ -59,10 +52,6 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
     figures = _figures(analysis, proof, odds)
     return Diagnosis(analysis.case.name, seed, clock.perf_counter() - begun, verdict, p_mismatch, where, hypotheses, heldout, sentence,
                      detection, tuple(notes), predictions, figures, asdict(analysis.scores))
-
-
-def _linear_only(rival: Rival) -> bool:
-    return rival.hypothesis is not None and bool(rival.hypothesis.effects) and not rival.hypothesis.forces and not rival.clip
 
 
 def _named(analysis: Analysis, odds: dict[Key, float], seed: int) -> tuple[Named, ...]:

@@ -25,7 +25,8 @@ MOST = 30  # rivals that are weighed; the rest are far behind
 
 FEATURES = (
     "none", "other", "pair",                        # what kind of answer
-    "lag", "relative lag",                          # gain behind the best, against the leftover and against the best gain
+    "lag", "steps behind", "relative lag",          # gain behind the best, against the leftover (two ways) and against the best gain
+    "gain of force", "gain of attachment", "gain of channel", "gain of incoherent", "gain of pair", "gain of other",    # by group
     "visible", "visible second",                    # response explained that nothing simpler explains (single; pair)
     "strength",                                     # response changed by the smallest effect
     "regret", "small regret",                       # error on records not fitted behind the best there
@@ -34,6 +35,11 @@ FEATURES = (
     "unexplained", "held", "linear leftover",       # for something outside the catalogue
     "attachment", "input or channel", "incoherent", "pair with attachment", "pair with incoherent",
 )
+AT_LEAST_ZERO = {"lag", "steps behind", "relative lag", "gain of force", "gain of attachment", "gain of channel", "gain of incoherent",
+                 "gain of pair", "gain of other", "visible", "visible second", "regret", "small regret", "second", "second share", "second of rest",
+                 "unexplained", "held", "linear leftover"}
+AT_MOST_ZERO = {"gain of best", "visible of best"}
+"""Signs that mean what they say: more evidence for a hypothesis never makes it less probable, however few cases speak otherwise."""
 _ATTACHMENTS = {"added_mass", "unmodelled_mode", "linear_stiffness", "other"}
 _CHANNELS = {"force_gain", "force_delay", "sensor_gain", "sensor_delay", "clipping"}
 _INCOHERENT = {"sensor_drift", "mains_hum", "base_motion"}
@@ -145,7 +151,7 @@ def features(scores: Scores) -> tuple[list[Key], Array]:
     none |= _lags(max(best, 0.0), max(best, 0.0), scale) | _regrets(scores.held, lowest)
     none |= {"none": 1.0, "gain of best": float(np.log1p(max(best, 0.0) / scale)), "visible of best": _decades(leader.visible, 1e-3)}
     strange = dict.fromkeys(FEATURES, 0.0)
-    strange |= {"other": 1.0, "unexplained": float(np.clip(np.log((scores.unexplained + 1e-3) / (1.001 - scores.unexplained)), -6, 6)) + 6,
+    strange |= {"other": 1.0, "gain of other": float(np.log1p(max(best, 0.0) / scale)), "unexplained": float(np.clip(np.log((scores.unexplained + 1e-3) / (1.001 - scores.unexplained)), -6, 6)) + 6,
                 "held": float(np.clip(lowest, 0, 4)), "linear leftover": float(np.clip(np.log(max(scores.linear, 1.0)), 0, 4))}
     keys = [i.key for i in items] + [(), STRANGE]
     return keys, np.array([[row[name] for name in FEATURES] for row in (*rows, none, strange)])
@@ -162,11 +168,14 @@ def _best_of_each(items: Sequence[Score]) -> list[Score]:
 def _of_item(i: Score, best: float, scale: float, lowest: float) -> dict[str, float]:
     pair = len(i.key) > 1
     classes = {cls for cls, _ in i.key}
+    group = "pair" if pair else _group(i.key[0][0])
     added = max(i.gain - i.alone, 1e-3)
     row = dict.fromkeys(FEATURES, 0.0) | _lags(max(best - i.gain, 0.0), max(best, 0.0), scale) | _regrets(i.held, lowest)
     row["pair"] = float(pair)
-    row["visible second" if pair else "visible"] = _decades(i.visible, 1e-3)
-    row["strength"] = _decades(i.strength, 1e-2)
+    row[f"gain of {group}"] = float(np.log1p(max(i.gain, 0.0) / scale))
+    if group != "incoherent":    # the size of what is not coherent is not known better than its noise
+        row["visible second" if pair else "visible"] = _decades(i.visible, 1e-3)
+        row["strength"] = _decades(i.strength, 1e-2)
     if pair:
         row["second"] = float(np.clip(np.log(added / (8 * scale)), -4, 6))
         row["second share"] = float(np.clip(np.log(added / max(best, 1e-3)), -8, 0))
@@ -174,14 +183,18 @@ def _of_item(i: Score, best: float, scale: float, lowest: float) -> dict[str, fl
         row["pair with attachment"] = float(bool(classes & _ATTACHMENTS))
         row["pair with incoherent"] = float(bool(classes & _INCOHERENT))
     else:
-        row["attachment"] = float(bool(classes & _ATTACHMENTS))
-        row["input or channel"] = float(bool(classes & _CHANNELS))
-        row["incoherent"] = float(bool(classes & _INCOHERENT))
+        row["attachment"] = float(group == "attachment")
+        row["input or channel"] = float(group == "channel")
+        row["incoherent"] = float(group == "incoherent")
     return row
 
 
+def _group(cls: str) -> str:
+    return ("attachment" if cls in _ATTACHMENTS else "channel" if cls in _CHANNELS else "incoherent" if cls in _INCOHERENT else "force")
+
+
 def _lags(behind: float, best: float, scale: float) -> dict[str, float]:
-    return {"lag": -float(np.log1p(behind / scale)), "relative lag": -float(np.log1p(behind / (scale + 0.01 * best)))}
+    return {"lag": -float(np.log1p(behind / scale)), "steps behind": -float(min(behind / scale, 10.0)), "relative lag": -float(np.log1p(behind / (scale + 0.01 * best)))}
 
 
 def _regrets(held: float, lowest: float) -> dict[str, float]:
@@ -220,7 +233,7 @@ def _softmax(x: Array) -> Array:
 
 def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer | None = None, provenance: str = "", spread: float = 1.0
               ) -> Layer:
-    """Weights that make the log loss over cases smallest, with a normal prior of width ``spread`` around ``start``.
+    """Weights that make the log loss over cases smallest, with a normal prior of width ``spread`` around ``start`` and signs as they must be.
 
     Parameters
     ----------
@@ -228,6 +241,7 @@ def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer | No
     """
     from scipy.optimize import minimize
 
+    limits = [(0.0 if name in AT_LEAST_ZERO else None, 0.0 if name in AT_MOST_ZERO else None) for name in FEATURES]
     origin = np.array((start or BY_HAND).weights)
     tables = []
     for one, truth in zip(scores, truths, strict=True):
@@ -243,7 +257,8 @@ def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer | No
             gradient = gradient + p @ table - table[right]
         return total, gradient
 
-    best = minimize(loss, origin, jac=True, method="L-BFGS-B", options={"maxiter": 500})
+    begin = np.clip(origin, [-np.inf if a is None else a for a, _ in limits], [np.inf if b is None else b for _, b in limits])
+    best = minimize(loss, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 500})
     return replace(start or BY_HAND, weights=tuple(float(x) for x in best.x),
                    provenance=provenance or f"fitted on {len(truths)} simulated cases")
 
@@ -252,8 +267,9 @@ def _layer(provenance: str, **weights: float) -> Layer:
     return Layer(tuple(weights.get(name.replace(" ", "_"), 0.0) for name in FEATURES), provenance)
 
 
-BY_HAND = _layer("set by hand before any fit", none=3.0, other=-6.0, pair=-2.0, lag=1.0, relative_lag=1.0, visible=1.0, visible_second=1.5,
-                 strength=0.5, regret=1.0, small_regret=0.3, second=1.0, second_share=0.3, second_of_rest=1.0, gain_of_best=0.5,
+BY_HAND = _layer("set by hand before any fit", none=3.0, other=-5.0, pair=-2.0, lag=0.7, steps_behind=0.1, relative_lag=0.5,
+                 gain_of_force=0.5, gain_of_attachment=0.5, gain_of_channel=0.5, gain_of_incoherent=0.5, gain_of_pair=0.5, gain_of_other=0.5, visible=1.0, visible_second=1.5,
+                 strength=0.5, regret=1.0, small_regret=0.3, second=1.0, second_share=0.3, second_of_rest=1.0, gain_of_best=0.0,
                  visible_of_best=-1.0, unexplained=0.8, held=0.5, linear_leftover=0.5)
 FITTED = _layer("fitted on 68 cases of studies/concealed (seeds 201 and 4711, periodic ones), log loss 0.92 on cases left out; "
                 "normal prior of width 1.5 around the weights set by hand",
