@@ -242,5 +242,6 @@ def _figures(analysis: Analysis, proof: Proof, odds: dict[Key, float]) -> dict[s
     for name, wave in proof.waves.items():
         out[f"heldout_{name}"] = wave[:limit].astype(np.float32)
         out[f"heldout_{name}_envelope"] = envelope(wave, analysis.case.rate)[::64]
+    out["heldout_channels"] = np.array([n for n, ok in zip(analysis.case.sensors, analysis.case.usable, strict=True) if ok])
     out["heldout_time"] = np.arange(min(limit, len(proof.waves["measured"]))) / analysis.case.rate
     return out

@@ -96,6 +96,15 @@ def latent_forces(latents: Sequence[Mapping[str, object]]) -> Figure:
     return figure
 
 
+def _telling(waves: Mapping[str, Array]) -> int:
+    """The channel that what was found changes most; the loudest where nothing changes."""
+    if "updated" in waves and "extended" in waves:
+        change = (waves["extended"] - waves["updated"]).std(axis=0)
+        if change.max() > 0:
+            return int(np.argmax(change))
+    return int(np.argmax(waves["measured"].std(axis=0)))
+
+
 def before_after(time: Array, waves: Mapping[str, Array], facts: str, channels: Sequence[str] = (), units: Sequence[str] = ()) -> Figure:
     """A record not used: measured, and the errors of the model as delivered, re-tuned, and extended.
 
@@ -109,7 +118,7 @@ def before_after(time: Array, waves: Mapping[str, Array], facts: str, channels: 
     channels, units : sequence of str (s,)
         Names, and m/s², m/s or m; numbered accelerations if not given.
     """
-    c = int(np.argmax(waves["measured"].std(axis=0)))
+    c = _telling(waves)
     name_of = channels[c] if len(channels) > c else f"sensor {c + 1}"
     names = [("nominal", "model as delivered", GREY), ("updated", "linear model, re-tuned", ORANGE),
              ("extended", "with what was found", BLUE)]
