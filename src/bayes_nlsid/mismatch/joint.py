@@ -67,7 +67,8 @@ class Joint:
         """The force effects at ``y``."""
         return tuple(unpack(e, y[a:b], e) for e, a, b in zip(self.forces, self.edges[:-1], self.edges[1:], strict=True))
 
-    def at(self, y: Array, theta: Array, x: Array, errors: Array, warm: tuple[Complex, ...] | None, most: int = 40) -> Point:
+    def at(self, y: Array, theta: Array, x: Array, errors: Array, warm: tuple[Complex, ...] | None, most: int = 40,
+           coarse: bool = False) -> Point:
         """Simulate all records at these parameters."""
         bench, evidence = self.bench, self.bench.evidence
         spectra = evidence.spectra
@@ -77,7 +78,7 @@ class Joint:
         fld = replace(self.h.fit.fields, modes=modes)
         fit = replace(self.h.fit, fields=fld, shape_errors=errors)
         h = paths_to_sensors(bench, fit, self.places, spectra.s, parts(spectra.s))
-        there = simulate(paths, spectra, self.effects(y), self.unique, warm, most=most)
+        there = simulate(paths.coarse if coarse else paths, spectra, self.effects(y), self.unique, warm, most=most)
         projected = np.stack([evidence.project(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)
         residual = (evidence.residual + np.einsum("lsj,rlj->rls", h, projected, optimize=True)) * self.root
         shadow = np.stack([evidence.shadow(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)[evidence.excited]
@@ -152,15 +153,16 @@ def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, error
     count = len(y) + len(theta)
     columns = np.zeros((count + len(x), now.residual.size), dtype=complex)
     change = np.zeros((count + len(x), *now.cleaned.shape), dtype=complex)
+    still = joint.at(y, theta, x, errors, now.motions, most=12, coarse=True)
     if kept is not None:
         columns[len(y):count], change[len(y):count] = kept[0][len(y):count], kept[1][len(y):count]
     for i in range(count if kept is None else len(y)):
         law, step = i < len(y), 1e-3 if i < len(y) else 1e-3 * float(np.clip(joint.sd[i - len(y)], 1e-3, 0.3))
         yy = y + step * (np.arange(len(y)) == i)
         tt = theta if law else theta + step * (np.arange(len(theta)) == i - len(y))
-        moved = joint.at(yy, tt, x, errors, now.motions, most=12)
-        columns[i] = ((now.residual - moved.residual) / step).ravel()
-        change[i] = (moved.cleaned - now.cleaned) / step
+        moved = joint.at(yy, tt, x, errors, now.motions, most=12, coarse=True)
+        columns[i] = ((still.residual - moved.residual) / step).ravel()
+        change[i] = (moved.cleaned - still.cleaned) / step
     linear = _columns(system, change, len(y))
     normal = (columns.conj() @ columns.T).real + linear[0]
     gradient = (columns.conj() @ now.residual.ravel()).real + linear[1]

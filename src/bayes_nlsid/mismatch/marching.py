@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.paths import MARCHED, Bed, LawAlong, forces_along, through
+from bayes_nlsid.mismatch.paths import Bed, LawAlong, forces_along, through
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -17,8 +17,8 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
     from bayes_nlsid.simulation.modal_march import march_modes
 
     steps, linear = paths.steps, paths.linear(record)
-    n = MARCHED * paths.samples
-    decay = np.exp(np.arange(n) / MARCHED * np.log(paths.window[1]))    # 1 for periodic records
+    n = paths.marched * paths.samples
+    decay = np.exp(np.arange(n) / paths.marched * np.log(paths.window[1]))    # 1 for periodic records
     rows = np.ascontiguousarray(linear.T)
     q0, v0 = (np.ascontiguousarray((np.fft.irfft(x, n, axis=1, norm="forward") / decay).T) for x in (rows, paths.s * rows))
     codes, powers = (np.array([law.code[k] for law in laws if law.code is not None]) for k in (0, 1))

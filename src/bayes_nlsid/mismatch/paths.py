@@ -84,6 +84,8 @@ class Bed:
         Of the structure, if nothing but its modes stands behind the paths: what a march in the order of time needs.
     rows : ndarray (J, m)
         Of the places in these modes.
+    marched : int
+        Steps of a march per sample.
     """
 
     s: Complex
@@ -96,6 +98,12 @@ class Bed:
     periodic: bool
     modes: Modes | None = None
     rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    marched: int = MARCHED
+
+    @property
+    def coarse(self) -> Bed:
+        """The same with the longest steps of a march: for derivatives, which need no more."""
+        return replace(self, marched=1)
 
     def at(self, places: list[int]) -> Bed:
         """Some of the places alone."""
@@ -108,7 +116,7 @@ class Bed:
         from bayes_nlsid.simulation.modal_march import propagators
 
         assert self.modes is not None
-        dt = self.dt / MARCHED
+        dt = self.dt / self.marched
         low = self.modes.omega * dt < QUICK
         high = self.rows[:, ~low] / self.modes.omega[~low]
         own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)

@@ -350,10 +350,11 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     normal = np.eye(len(y))
     for _ in range(steps):
         columns = np.empty((len(y), *rest.shape), dtype=complex)
+        still = simulate(paths.coarse, spectra, effects_at(y), unique, now.motions, most=12)
         for i in range(len(y)):
             step = 1e-3
-            moved = simulate(paths, spectra, effects_at(y + step * (np.arange(len(y)) == i)), unique, now.motions, most=12)
-            columns[i] = (response(moved.lines) - response(now.lines)) / step
+            moved = simulate(paths.coarse, spectra, effects_at(y + step * (np.arange(len(y)) == i)), unique, now.motions, most=12)
+            columns[i] = (response(moved.lines) - response(still.lines)) / step
         flat, r = columns.reshape(len(y), -1), rest.ravel()
         normal = (flat.conj() @ flat.T).real + 1e-2 * np.eye(len(y))
         gradient = (flat.conj() @ r).real

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.forces.compiled import compiled, law_value
 
 Array = NDArray[np.float64]
+CLOSE = 1e-5    # last step of Newton's method over the largest force so far
 
 
 def propagators(omega: Array, zeta: Array, dt: float) -> tuple[Array, Array]:
@@ -81,7 +82,7 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
     Returns
     -------
     int
-        Steps whose equation was not solved to 1e-9 of the largest force so far.
+        Steps whose equation was not solved.
     """
     steps, places = q0.shape
     modes = b.shape[1]
@@ -93,9 +94,9 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
             for m in range(modes):
                 direct_q[j, k] += b[j, m] * b[k, m] * forced[1, m]
                 direct_v[j, k] += b[j, m] * b[k, m] * forced[3, m]
-    q, v, x, old = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
+    q, v, x, old, older = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
     for j in range(places):
-        old[j] = before[j]
+        old[j] = older[j] = before[j]
     lost, largest = 0, 1e-300
     for i in range(steps):
         qa, va, qb, vb = 0.0, 0.0, 0.0, 0.0
@@ -111,7 +112,7 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
             vb += b[last, m] * speed
         q[0], q[1], v[0], v[1] = qa, qb, va, vb
         for j in range(places):
-            q[j], v[j], x[j] = q0[i, j] - q[j], v0[i, j] - v[j], old[j]
+            q[j], v[j], x[j] = q0[i, j] - q[j], v0[i, j] - v[j], 2.0 * old[j] - older[j]
         solved = False
         for _ in range(60):
             f0, k0, c0 = law_value(codes[0], powers[0], q[0] - direct_q[0, 0] * x[0] - direct_q[0, 1] * x[1],
@@ -130,12 +131,12 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
             x[0] += s0
             x[1] += s1
             largest = max(largest, abs(x[0]), abs(x[1]))
-            if abs(s0) + abs(s1) <= 1e-9 * largest:
+            if abs(s0) + abs(s1) <= CLOSE * largest:    # what is left after this step is its square
                 solved = True
                 break
         lost += 0 if solved else 1
         for j in range(places):
-            g[i, j], old[j] = x[j], x[j]
+            g[i, j], old[j], older[j] = x[j], x[j], old[j]
         ua, ub = x[0], x[1] if last else 0.0
         for m in range(modes):
             u = b[0, m] * ua + b[last, m] * ub
