@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bayes_nlsid.mismatch.probability import BY_HAND, FEATURES, Layer, Scores, fit_layer, probabilities, scores_from
+from bayes_nlsid.mismatch.probability import FEATURES, SHIPPED, Layer, Scores, fit_layer, probabilities, scores_from
 
 
 def gather(results: Path, answers: Path) -> tuple[list[Scores], list[tuple[tuple[str, str], ...]]]:
     """Scores and true keys of all cases that have both.
 
-    A case whose effect the search did not even propose, although the catalogue has it, teaches nothing about how to weigh what was proposed:
-    it is left out. (What is outside the catalogue is: it counts as ``other``.)
+    A case whose effect the search did not even propose, although the catalogue has it, teaches nothing about how to weigh what was
+    proposed: it is left out. What is outside the catalogue counts as ``other``.
     """
     scores, truths = [], []
     for file in sorted(results.glob("*/scores.json")):
@@ -49,10 +49,10 @@ def refit(results: list[Path], answers: list[Path], spread: float = 1.0, folds: 
     for k in range(folds):
         keep = [i for i in range(len(scores)) if i % folds != k]
         test = [i for i in range(len(scores)) if i % folds == k]
-        layer = fit_layer([scores[i] for i in keep], [truths[i] for i in keep], BY_HAND, "", spread)
+        layer = fit_layer([scores[i] for i in keep], [truths[i] for i in keep], SHIPPED, "", spread)
         left_out += [log_loss(layer, [scores[i]], [truths[i]]) for i in test]
-    final = fit_layer(scores, truths, BY_HAND, f"fitted on {len(truths)} simulated cases", spread)
-    print(f"{len(truths)} cases; log loss by hand {log_loss(BY_HAND, scores, truths):.3f}, on cases left out {np.mean(left_out):.3f}, "
+    final = fit_layer(scores, truths, SHIPPED, f"fitted on {len(truths)} simulated cases", spread)
+    print(f"{len(truths)} cases; log loss as shipped {log_loss(SHIPPED, scores, truths):.3f}, on cases left out {np.mean(left_out):.3f}, "
           f"on all {log_loss(final, scores, truths):.3f}")
     print(", ".join(f"{name.replace(' ', '_')}={weight:.3f}" for name, weight in zip(FEATURES, final.weights, strict=True)))
     return final
@@ -63,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies.refit_layer", description=__doc__)
     parser.add_argument("--results", type=Path, required=True, nargs="+")
     parser.add_argument("--answers", type=Path, required=True, nargs="+")
-    parser.add_argument("--spread", type=float, default=1.0, help="standard deviation of the weights around those set by hand")
+    parser.add_argument("--spread", type=float, default=1.0, help="standard deviation of the weights around those shipped")
     options = parser.parse_args()
     refit(options.results, options.answers, options.spread)
 
