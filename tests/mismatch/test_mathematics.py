@@ -204,6 +204,25 @@ def test_a_march_agrees_with_newton_on_the_whole_record(begun: bool) -> None:
     assert np.linalg.norm(D - E) < 6e-3 * np.linalg.norm(E) and np.linalg.norm(G - H) < 5e-2 * np.linalg.norm(H)
 
 
+def test_a_hard_stop_does_not_ring() -> None:
+    """A gap a hundred times stiffer than the joint it sits in: with steps too long for it the march refines them by itself."""
+    codes = pytest.importorskip("bayes_nlsid.forces.compiled")
+    fam = chain_family()
+    spectra = steady(fam, np.zeros(fam.size), records=2)
+    paths = bed(solve(fam, np.zeros(fam.size)), spectra, fam.places["J3_slip"][None], fam.shaker)
+    gap = ROWS["clearance"].laws[1]
+    d = paths.in_time(paths.linear(1))[0].std()
+    p = np.array([4e7, 2.0 * d, 0.02])
+    assert gap.term.name == "rounded_gap"
+    law = replace(_as_law(gap.term, p), code=codes.law_code(gap.term), values=p)
+    found = [settle(replace(paths, marched=m), 1, (law,)) for m in (1, 4, 64)]
+    assert all(status == "ok" for _, _, status in found)
+    change = np.linalg.norm(found[2][0] - paths.linear(1))
+    assert change > 0.5 * np.linalg.norm(paths.linear(1))
+    for D, _, _ in found[:2]:
+        assert np.linalg.norm(D - found[2][0]) < 0.02 * change
+
+
 def test_gmres_solves_a_real_linear_system() -> None:
     rng = np.random.default_rng(5)
     A = np.eye(30) + 0.2 * rng.normal(size=(30, 30))

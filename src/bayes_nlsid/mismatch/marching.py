@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,9 @@ from bayes_nlsid.mismatch.paths import Bed, LawAlong, forces_along, through
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+RINGING = 1.0   # second difference of a force over the force: 4 where it changes sign at every step
+HUGE = 1e100    # N; only a march that has lost its law gets there
+FINEST = 32     # steps per sample beyond which nothing is refined
 
 
 def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None = None, passes: int = 5
@@ -33,8 +38,12 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
     for _ in range(passes if paths.periodic else 1):
         begun = state.copy()
         lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, codes, powers, values, g, state, before)
+        if paths.marched < FINEST and _rings(g):
+            return march_laws(replace(paths, marched=4 * paths.marched), record, laws, start, passes)
+        if not np.abs(g).max() < HUGE:
+            return linear, np.zeros_like(linear), False
         G = np.asarray(np.fft.rfft(g * decay[:, None], axis=0, norm="forward")[:len(paths.s)])
-        if not paths.periodic or not np.isfinite(g).all():
+        if not paths.periodic:
             break
         sizes = np.abs(state).max(axis=1, keepdims=True) + 1e-300
         change = float((np.abs(state - begun) / sizes).max())
@@ -43,7 +52,15 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
             break
         state, before = _begin(paths, G), g[-1].copy()
     D = linear - through(paths.among, G)
-    return D, G, bool(np.isfinite(g).all() and closed and lost < 1e-3 * n)
+    return D, G, bool(closed and lost < 1e-3 * n)
+
+
+def _rings(g: Array) -> bool:
+    """Whether a force changes sign from step to step, as that of a hard stop does where the steps are too long for it."""
+    largest = float(np.abs(g).max())
+    if not largest < HUGE:
+        return True
+    return bool(largest > 0 and np.linalg.norm(np.diff(g, 2, axis=0)) > RINGING * np.linalg.norm(g))
 
 
 def _begin(paths: Bed, G: Complex) -> Array:
