@@ -155,6 +155,7 @@ def _advance(target: Target, task: tuple[Walkers, int, Mixture | None]) -> Block
 
 MOST_STEPS, BLOCK = 20_000, 200
 LEAST_BURN, BURN_TIMES = 400, 10     # burn-in: at least so many steps, and so many autocorrelation times
+LESSON, LESSONS = 800, 3             # steps after which a mixture is learnt again where the chain is slow, and how often at most
 KEEP = 200_000                       # draws kept in a Posterior
 
 Progress = Callable[[float, str], None]
@@ -169,6 +170,7 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
     Burn-in ends after ten autocorrelation times (at least 400 steps, at most a quarter of ``most``). During it walkers that stand still
     or lie far below their ensemble are re-drawn from the others and counted; after it nothing is touched. Then every ensemble goes on until
     all parameters have nested R-hat ≤ 1.01, a chain of 50 autocorrelation times and 400 effective samples, or ``most`` steps are done.
+    A chain still slow after 800 steps is burn-in after all, up to three times: the mixture of its proposals is learnt again from it.
 
     Parameters
     ----------
@@ -247,6 +249,8 @@ class _Run:
     blocks: list[list[Block]] = field(default_factory=list)     # by block, then ensemble
     burn_blocks: int | None = None
     mixture: Mixture | None = None
+    first_burn: int | None = None
+    lessons: int = 0
     redrawn: int = 0
     stopped: str = ""
     next_check: int = 0
@@ -322,7 +326,19 @@ class _Run:
         if steps < self.next_check:      # diagnostics cost as much as many steps: look again after a quarter more
             return False
         self.next_check = int(1.25 * steps)
-        return self._assess(*self._chain(self.burn_blocks or 0)).converged
+        found = self._assess(*self._chain(self.burn_blocks or 0))
+        slow = LENGTH * float(np.max(found.tau, initial=1.0)) > 3 * steps
+        if not found.converged and slow and self.lessons < LESSONS and steps >= LESSON:
+            self._learn_again()
+        return found.converged
+
+    def _learn_again(self) -> None:
+        """A mixture learnt too early leaves part of the posterior to slow moves: what was drawn teaches a new one, and is dropped."""
+        if self.first_burn is None:
+            self.first_burn = self.burn_blocks or 0
+        draws = self._chain(self.first_burn)[0]
+        self.mixture = learn_mixture(draws.transpose(1, 0, 2, 3).reshape(-1, draws.shape[-1]), self.prune_seed)
+        self.burn_blocks, self.next_check, self.lessons = len(self.blocks), 0, self.lessons + 1
 
     def _assess(self, s: Array, value: Array, accepted: Array) -> Convergence:
         problem = self.target.problem
