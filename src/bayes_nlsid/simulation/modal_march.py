@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.forces.compiled import compiled, law_value
+from bayes_nlsid.simulation.schemes import steps
 
 Array = NDArray[np.float64]
 CLOSE = 1e-5    # last step of Newton's method over the largest force so far
 
 
 def propagators(omega: Array, zeta: Array, dt: float) -> tuple[Array, Array]:
-    """One step of ẍ + 2 ζ ω ẋ + ω² x = u with u linear in time (first-order hold), exact.
+    """The exponential step of ``simulation.schemes`` (ẍ + 2 ζ ω ẋ + ω² x = u, u linear in time), laid out for ``march_modes``.
 
     Parameters
     ----------
@@ -39,18 +40,10 @@ def propagators(omega: Array, zeta: Array, dt: float) -> tuple[Array, Array]:
     forced : ndarray (4, m)
         x and ẋ per u before (rows 0, 2) and per u after (rows 1, 3).
     """
-    from scipy.linalg import expm
-
-    rates = np.zeros((len(omega), 4, 4))
-    rates[:, 0, 1] = rates[:, 1, 2] = rates[:, 2, 3] = 1.0
-    rates[:, 1, 0], rates[:, 1, 1] = -omega**2, -2 * zeta * omega
-    # In units of the step, so that large frequencies do not spoil the small entries: ẋ dt, u dt², u̇ dt³.
-    scale = dt ** np.arange(4)
-    E = expm(rates * dt * scale[None, :, None] / scale[None, None, :])
-    after_x, after_v = E[:, 0, 3] * dt**2, E[:, 1, 3] * dt
-    own = np.stack([E[:, 0, 0], E[:, 0, 1] * dt, E[:, 1, 0] / dt, E[:, 1, 1]])
-    forced = np.stack([E[:, 0, 2] * dt**2 - after_x, after_x, E[:, 1, 2] * dt - after_v, after_v])
-    return np.ascontiguousarray(own), np.ascontiguousarray(forced)
+    one = steps(omega, zeta, dt, "exponential")
+    own = one.amplification.reshape(-1, 4).T
+    forced = np.stack([one.old[:, 0], one.new[:, 0], one.old[:, 1], one.new[:, 1]])
+    return np.ascontiguousarray(own), forced
 
 
 @partial(compiled, fastmath={"contract", "reassoc", "nsz"})
@@ -84,7 +77,7 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
     int
         Steps whose equation was not solved.
     """
-    steps, places = q0.shape
+    count, places = q0.shape
     modes = b.shape[1]
     last = places - 1
     direct_q, direct_v = np.zeros((2, 2)), np.zeros((2, 2))
@@ -98,7 +91,7 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
     for j in range(places):
         old[j] = older[j] = before[j]
     lost, largest = 0, 1e-300
-    for i in range(steps):
+    for i in range(count):
         qa, va, qb, vb = 0.0, 0.0, 0.0, 0.0
         ua, ub = old[0], old[1] if last else 0.0
         for m in range(modes):
