@@ -32,12 +32,12 @@ def power_spring_slope(q: Value, v: Value, f: Value, d: Value, n: Value) -> Valu
 
 def falling_spring(q: Value, v: Value, f: Value, d: Value, n: Value) -> Value:
     """−f sgn(q)(|q|/d)^n."""
-    return -f * np.sign(q) * (np.abs(q) / d) ** n
+    return -power_spring(q, v, f, d, n)
 
 
 def falling_spring_slope(q: Value, v: Value, f: Value, d: Value, n: Value) -> Value:
     """−f n/d (|q|/d)^(n−1), for n > 1."""
-    return -f * n / d * (np.abs(q) / d) ** (n - 1.0), 0.0
+    return -power_spring_slope(q, v, f, d, n)[0], 0.0
 
 
 def levelling(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
@@ -54,14 +54,12 @@ def levelling_slope(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
 
 def saturating(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
     """−k q r/(1 + r) with r = (|q|/d)^m."""
-    r = (np.abs(q) / d) ** m
-    return -k * q * r / (1.0 + r)
+    return -levelling(q, v, k, d, m)
 
 
 def saturating_slope(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
     """−k r (1 + m + r)/(1 + r)²."""
-    r = (np.abs(q) / d) ** m
-    return -k * r * (1.0 + m + r) / (1.0 + r) ** 2, 0.0
+    return -levelling_slope(q, v, k, d, m)[0], 0.0
 
 
 def rounded_gap(q: Value, v: Value, k: Value, e: Value, w: Value) -> Value:
