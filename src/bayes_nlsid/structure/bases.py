@@ -15,13 +15,13 @@ from bayes_nlsid.structure.reduction import (
     Guard,
     Reduced,
     Target,
+    hold,
     inertia_relief,
+    lowest,
     master_rows,
     project,
-    statics,
-    unseen,
 )
-from bayes_nlsid.structure.structure import Modes, Structure
+from bayes_nlsid.structure.structure import Structure
 from bayes_nlsid.structure.structure import modes as full_modes
 
 
@@ -60,7 +60,7 @@ def serep(structure: Structure, masters: Sequence[str] | ArrayLike, modes: int, 
         raise ValueError(f"serep: the masters do not see all combinations of {basis.shape[1]} modes (condition number {condition:.2g}); "
                          f"keep fewer modes or add masters")
     T = basis @ np.linalg.pinv(seen)
-    target = Target.of(structure, _lowest(found, min(compare, modes)), found.rigid.shape[1])
+    target = Target.of(structure, lowest(found, min(compare, modes)), found.rigid.shape[1])
     matrices = project(structure.M, T), project(structure.K, T)
     note = f"condition number of the modes at the masters {condition:.2g}"
     return target.reduced(names, T, matrices, [target.step(T, *matrices)], f"serep, {modes} elastic modes", (note,))
@@ -91,10 +91,8 @@ def craig_bampton(structure: Structure, masters: Sequence[str] | ArrayLike, mode
     """
     from scipy.sparse.linalg import LinearOperator, eigsh
 
-    names, A = master_rows(structure, masters)
-    full = full_modes(structure, compare)
-    constraint, notes = unseen(structure, A, full.rigid, guard)
-    T, S = statics(structure.K, A, constraint)
+    held = hold(structure, masters, compare, guard)
+    T, S = held.T, held.S
     if modes:
         # Modes with A φ = 0: S M φ = φ/ω², where S answers forces with all masters held.
         size = structure.size
@@ -102,11 +100,10 @@ def craig_bampton(structure: Structure, masters: Sequence[str] | ArrayLike, mode
         start = inverse @ (structure.M @ np.random.default_rng(0).standard_normal(size))
         values, fixed = eigsh(structure.K, k=modes, M=structure.M, sigma=0.0, OPinv=inverse, v0=start)
         T = np.hstack([T, fixed[:, np.argsort(values)]])
-    rigid = full.rigid.shape[1] - (0 if constraint is None else len(constraint))
-    target = Target.of(structure, _lowest(full, compare), rigid)
+    target = Target.of(structure, lowest(held.full, compare), held.rigid)
     matrices = project(structure.M, T), project(structure.K, T)
-    names = (*names, *(f"fixed{i + 1}" for i in range(modes)))
-    return target.reduced(names, T, matrices, [target.step(T, *matrices)], f"craig-bampton, {modes} fixed-interface modes", notes)
+    names = (*held.names, *(f"fixed{i + 1}" for i in range(modes)))
+    return target.reduced(names, T, matrices, [target.step(T, *matrices)], f"craig-bampton, {modes} fixed-interface modes", held.notes)
 
 
 def attachment_modes(structure: Structure, modes: int | Sequence[int] = 10, *, at: Sequence[str] | None = None, compare: int = 10,
@@ -148,7 +145,7 @@ def attachment_modes(structure: Structure, modes: int | Sequence[int] = 10, *, a
         names += [f"static[{name}]" for name in places]
     first = 0 if rigid else found.rigid.shape[1]
     T = basis[:, first:]
-    target = Target.of(structure, _lowest(found, compare), found.rigid.shape[1] - first)
+    target = Target.of(structure, lowest(found, compare), found.rigid.shape[1] - first)
     matrices = project(structure.M, T), project(structure.K, T)
     method = f"{len(index)} modes and {len(places)} attachment modes" if places else f"{len(index)} modes"
     return target.reduced(tuple(names[first:]), T, matrices, [target.step(T, *matrices)], method)
@@ -168,7 +165,3 @@ def _orthonormal(structure: Structure, shapes: NDArray[np.float64], basis: NDArr
             raise ValueError(f"attachment modes: the static shape of {name!r} is already held by the others; leave it out")
         out = np.column_stack([out, left / norm])
     return out[:, basis.shape[1]:]
-
-
-def _lowest(found: Modes, count: int) -> Modes:
-    return Modes(found.rigid, found.omega[:count], found.shapes[:, :count])

@@ -128,15 +128,12 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
     """
     if iterations < 0 or not 0 < tolerance or compare < 1:
         raise ValueError(f"iirs: iterations {iterations} must be >= 0, tolerance {tolerance} and compare {compare} positive")
-    names, A = master_rows(structure, masters)
-    full = modes(structure, compare)
-    constraint, notes = unseen(structure, A, full.rigid, guard)
-    T_s, S = statics(structure.K, A, constraint)
-    rigid = full.rigid.shape[1] - (0 if constraint is None else constraint.shape[0])
+    held = hold(structure, masters, compare, guard)
+    full, names, rigid, T_s, S = held.full, held.names, held.rigid, held.T, held.S
     count = min(len(full.omega), len(names) - rigid)
     if count < 1:
         raise ValueError(f"{len(names)} masters only follow the {rigid} rigid-body modes; add masters to follow elastic ones")
-    target = Target.of(structure, Modes(full.rigid, full.omega[:count], full.shapes[:, :count]), rigid)
+    target = Target.of(structure, lowest(full, count), rigid)
     T, M_r, K_r = T_s, project(structure.M, T_s), project(structure.K, T_s)
     history = [target.step(T, M_r, K_r)]
     while len(history) <= iterations and not _met(history[-1], tolerance, least_mac):
@@ -144,7 +141,7 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
         M_r, K_r = project(structure.M, T), project(structure.K, T)
         history.append(target.step(T, M_r, K_r))
     method = "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations"
-    return target.reduced(names, T, (M_r, K_r), history, method, notes, tolerance, least_mac)
+    return target.reduced(names, T, (M_r, K_r), history, method, held.notes, tolerance, least_mac)
 
 
 def without_rigid_body(reduced: Reduced) -> Reduced:
@@ -209,7 +206,35 @@ def master_rows(structure: Structure, masters: Sequence[str] | ArrayLike) -> tup
     return names, A
 
 
-def unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.float64],
+@final
+@dataclass(frozen=True)
+class Held:
+    """A structure by its masters: names, modes of the whole, static shapes T (N, n), the operator S that answers forces with the masters
+    held, the number of rigid-body modes that the masters can follow, and what there is to say about them."""
+
+    names: tuple[str, ...]
+    full: Modes
+    T: NDArray[np.float64]
+    S: Any
+    rigid: int
+    notes: tuple[str, ...]
+
+
+def hold(structure: Structure, masters: Sequence[str] | ArrayLike, compare: int, guard: Guard) -> Held:
+    """Masters, checked and held; raises as `iirs`."""
+    names, A = master_rows(structure, masters)
+    full = modes(structure, compare)
+    constraint, notes = _unseen(structure, A, full.rigid, guard)
+    T, S = _statics(structure.K, A, constraint)
+    return Held(names, full, T, S, full.rigid.shape[1] - (0 if constraint is None else len(constraint)), notes)
+
+
+def lowest(found: Modes, count: int) -> Modes:
+    """The rigid and the first so many elastic modes."""
+    return Modes(found.rigid, found.omega[:count], found.shapes[:, :count])
+
+
+def _unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.float64],
             guard: Guard) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """Extra rows (k, N) that hold unseen rigid-body modes, and what to say about them."""
     if rigid.shape[1] == 0:
@@ -229,7 +254,7 @@ def unseen(structure: Structure, A: NDArray[np.float64], rigid: NDArray[np.float
     return (structure.M @ hidden).T, (sentence + "; they are held still",)
 
 
-def statics(K: Matrix, A: NDArray[np.float64], constraint: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], Any]:
+def _statics(K: Matrix, A: NDArray[np.float64], constraint: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], Any]:
     """T_G (N, n) and the operator S, from one factorisation."""
     rows = A if constraint is None else np.vstack([A, constraint])
     solve = _saddle(K, rows)
