@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from studies.any_recording.score import NO_PHYSICS
 
 from bayes_nlsid.mismatch.odds import LAYER, Findings, OddsLayer, findings_from, odds_of
 
 MOVED = ("least", "part", "surety", "seen", "blind", "shown", "scale", "share", "power", "useless", "floor", "along", "second", "beside",
          "proof", "unexplained", "withdrawn")
 PRIOR_SD = 0.5
-NO_PHYSICS = ("none", "force_delay", "sensor_gain")
 LEAST = 0.01   # a probability below it counts as this
 
 

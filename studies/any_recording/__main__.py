@@ -28,9 +28,9 @@ def main() -> None:
 
         generate(given.cases, given.seed, given.out, given.answers)
     elif given.command == "run":
-        from studies.any_recording.run import run as run_all
+        from studies.concealed.run import run as run_all
 
-        run_all(given.cases, given.out)
+        run_all(given.cases, given.out, workers=1)
     elif given.command == "score":
         from studies.any_recording.score import gather, table
 
