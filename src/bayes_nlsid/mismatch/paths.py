@@ -96,8 +96,8 @@ class Bed:
     dt: float
     window: Array
     periodic: bool
-    modes: Modes | None = None
-    rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    modes: Modes | None
+    rows: Array
     marched: int = MARCHED
 
     @property
@@ -107,8 +107,7 @@ class Bed:
 
     def at(self, places: list[int]) -> Bed:
         """Some of the places alone."""
-        return replace(self, to_force=self.to_force[:, places], among=self.among[:, places][:, :, places],
-                       rows=self.rows[places] if self.modes is not None else self.rows)
+        return replace(self, to_force=self.to_force[:, places], among=self.among[:, places][:, :, places], rows=self.rows[places])
 
     @cached_property
     def steps(self) -> Steps:
