@@ -65,7 +65,9 @@ def test_refusals(arguments: list[str], status: int, words: str, tmp_path: Path,
 def test_wrong_usage_is_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
-    assert ended.value.code == 2 and "Traceback" not in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and said.out == "" and said.err.count("\n") == 1, said
+    assert said.err.startswith("nlsid") and said.err.rstrip().endswith("--help."), said
 
 
 def test_new_then_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, final
 
 from bayes_nlsid import __version__
 from bayes_nlsid.errors import InputError
@@ -38,8 +38,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
 
 
+@final
+class _Parser(argparse.ArgumentParser):
+    """Wrong usage is bad input like any other: one sentence, not the whole usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help.\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    top = argparse.ArgumentParser(prog="nlsid", description="Nonlinear models of jointed structures from recordings, with their "
+    top = _Parser(prog="nlsid", description="Nonlinear models of jointed structures from recordings, with their "
                                                             "uncertainty.",
                                   epilog="Exit status: 0 done, 1 done but the answer is a refusal (the reason is printed and stored), "
                                          "2 bad input, 130 stopped.")
@@ -81,8 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     return top
 
 
-def _common() -> argparse.ArgumentParser:
-    common = argparse.ArgumentParser(add_help=False)
+def _common() -> _Parser:
+    common = _Parser(add_help=False)
     group = common.add_argument_group("common options")
     group.add_argument("--seed", type=_whole, metavar="N", help="in place of the seed of the study")
     group.add_argument("--workers", type=_positive, default=1, metavar="N", help="threads or processes; results do not depend on it")

@@ -70,6 +70,9 @@ ARCHIVES: dict[str, tuple[tuple[str, str], dict[str, Any], list[str]]] = {
     "name with brackets": (("[posterior]", '[[terms]]\nname = "my [term]"\nformula = "c*q"\nparams = { c = ["N/m", "coefficient"] }\n'
                             "[posterior]"), arrays(), ["cannot be a name of a term"]),
     "negative noise": (('unit = "N"\n', 'unit = "N"\nnoise = -1.0\n'), arrays(), ["noise", "is negative"]),
+    "backbone of a driven motion": (('heldout = ["later part"]', 'measured = "later part"'), arrays(), ["is driven to its end"]),
+    "complex numbers": (("", ""), swap(acceleration=arrays()["acceleration"] + 1j), ["'acceleration' holds complex numbers"]),
+    "text for numbers": (("", ""), swap(acceleration=np.array(["a"] * N)), ["'acceleration' holds text", "plain numbers"]),
     "pickled archive": (("", ""), swap(acceleration=np.array([{}] * 3, dtype=object)), ["pickled Python objects"]),
 }
 FILES: dict[str, tuple[str, dict[str, Any], list[str]]] = {
@@ -166,3 +169,21 @@ def test_what_is_doubtful_is_told_before_and_after(make: Callable[[np.ndarray], 
     assert main(["check", str(tmp_path / "study.toml")]) == 0
     plan = " ".join(capsys.readouterr().out.split())
     assert words in plan and "no force is recorded, and yet the motion does not decay" in plan
+
+
+def test_an_inverted_force_and_a_wrong_unit_are_told_by_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No low-level recording is named, one sensor, one force: the sign and the size of the answer still have to be those of the model."""
+    from bayes_nlsid.study.template import example_recording
+
+    text, good = TEXT[:TEXT.index("[identification]")], example_recording()
+    for name, change, words in (("right", {}, None), ("turned", {"force": -good["force"]}, "force at x is inverted, or this channel is"),
+                                ("in g", {"acceleration": good["acceleration"] / 9.80665}, "g for m/s²")):
+        folder = tmp_path / name
+        folder.mkdir()
+        put(folder / "recording.npz", {**good, **change})
+        put(folder / "study.toml", text)
+        assert main(["run", str(folder / "study.toml"), "--out", str(folder / "out")]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+        assert ("beware" in said) == ("Polarity" in page) == (words is not None), said
+        assert words is None or (words in said and words in page and words in (folder / "out" / "run.log").read_text(encoding="utf-8"))

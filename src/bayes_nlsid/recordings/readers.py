@@ -45,6 +45,8 @@ class Contents:
         Of the bytes that were parsed.
     quantities : dict of str to str
         What an array measures, where the file says so.
+    unusable : dict of str to str
+        Arrays that are there but hold no real numbers, and what they hold.
     """
 
     path: str
@@ -52,6 +54,7 @@ class Contents:
     units: Mapping[str, str]
     sha256: str
     quantities: Mapping[str, str] = field(default_factory=dict)
+    unusable: Mapping[str, str] = field(default_factory=dict)
 
 
 @final
@@ -62,6 +65,7 @@ class Parsed:
     arrays: Arrays
     units: Mapping[str, str] = field(default_factory=dict)
     quantities: Mapping[str, str] = field(default_factory=dict)
+    unusable: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_file(path: str | Path) -> Contents:
@@ -101,14 +105,18 @@ def read_file(path: str | Path) -> Contents:
                          "it is damaged, cut short or of another kind: export it again") from error
     if not found.arrays:
         raise InputError(str(file), "holds no numeric array", "export the recording again")
-    return Contents(str(file), found.arrays, found.units, hashlib.sha256(data).hexdigest(), found.quantities)
+    return Contents(str(file), found.arrays, found.units, hashlib.sha256(data).hexdigest(), found.quantities, found.unusable)
 
 
 # ---------------------------------------------------------------------------------------------------------------------- npz
 
+_KINDS = {"c": "complex numbers", "U": "text", "S": "text", "M": "dates", "m": "time spans", "V": "records of several fields"}
+
+
 def _read_npz(data: bytes) -> Parsed:
     """Arrays of an npz archive; declared sizes are checked against the archive before anything is unpacked."""
     arrays: Arrays = {}
+    unusable: dict[str, str] = {}
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise Unreadable("is not an npz archive", "it is cut short or of another kind: save it with numpy.savez")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -128,7 +136,9 @@ def _read_npz(data: bytes) -> Parsed:
                 if dtype.kind in "fiub":
                     values = np.frombuffer(stream.read(count * dtype.itemsize), dtype=dtype, count=count)
                     arrays[name] = values.reshape(shape, order="F" if fortran else "C")
-    return Parsed(arrays)
+                else:
+                    unusable[name] = _KINDS.get(dtype.kind, f"entries of type {dtype}")
+    return Parsed(arrays, unusable=unusable)
 
 
 def _check_unpacked(size: int) -> None:

@@ -231,6 +231,8 @@ def _notes(spec: RecordingSpec) -> tuple[str, ...]:
 
 
 def _find(contents: Contents, name: str, where: str) -> NDArray[np.generic]:
+    if name in contents.unusable:
+        raise InputError(where, f"array {name!r} holds {contents.unusable[name]}, not real numbers", "store it as plain numbers")
     if name not in contents.arrays:
         shown = [f"{k} {v.shape}" for k, v in list(contents.arrays.items())[:20]]
         more = f" and {len(contents.arrays) - 20} more" if len(contents.arrays) > 20 else ""

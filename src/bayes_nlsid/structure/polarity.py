@@ -33,9 +33,9 @@ class PolarityFinding:
     Parameters
     ----------
     channel : str
-    kind : {"inverted", "swapped"}
+    kind : {"inverted", "swapped", "scaled"}
     confidence : float
-        Posterior probability among the alternatives tried.
+        Posterior probability among the alternatives tried; with a measured force, correlation with the computed response.
     sentence : str
         What a person would say.
     other : str
@@ -43,7 +43,7 @@ class PolarityFinding:
     """
 
     channel: str
-    kind: Literal["inverted", "swapped"]
+    kind: Literal["inverted", "swapped", "scaled"]
     confidence: float
     sentence: str
     other: str = ""

@@ -8,7 +8,7 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.study.context import Context
 from bayes_nlsid.study.schema import IdentificationEntry, Study
-from bayes_nlsid.study.stage_read import describe, refuse_dead
+from bayes_nlsid.study.stage_read import describe, refuse_dead, refuse_driven
 
 
 def examine(study: Study) -> list[dict[str, Any]]:
@@ -24,6 +24,8 @@ def examine(study: Study) -> list[dict[str, Any]]:
     for recording in context.recordings.values():
         found.append(describe(recording, context.noise(recording)))
         refuse_dead(context, recording, found[-1]["findings"])
+    if study.prediction is not None and study.prediction.measured is not None:
+        refuse_driven(context, context.recordings[study.prediction.measured])
     if study.identification is not None:
         for record in found:
             if record["role"] == "train":

@@ -10,11 +10,12 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
 from bayes_nlsid.recordings.units import unit_factor
+from bayes_nlsid.study.consistency import check_consistency
 from bayes_nlsid.study.reading_extras import read_compare, read_frf, read_montecarlo
 from bayes_nlsid.study.reading_method import read_identification, read_posterior, read_prediction, read_report, read_terms
 from bayes_nlsid.study.reading_plan import read_plan
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
-from bayes_nlsid.study.schema import IdentificationEntry, LinearEntry, Study
+from bayes_nlsid.study.schema import LinearEntry, Study
 from bayes_nlsid.study.store import file_digest
 from bayes_nlsid.study.table import FILL_IN, Table, gaps, nearest
 
@@ -52,14 +53,14 @@ def read_study(path: Path | str) -> Study:
     outline = top.table("structure")
     if outline is None:
         raise InputError(f"{file.name}: [structure]", "is missing", 'add [structure] with kind = "beam", "matrices" or "oscillator"')
-    structure, locations = read_structure(outline)
+    structure, built = read_structure(outline)
+    locations = tuple(built.locations)
     reduction = read_reduction(top.table("reduction"), structure)
     terms = read_terms(top)
     plan = read_plan(top.table("plan"), locations, terms)
     recordings = _read_recordings(top, locations, needed=plan is None)
     linear = _read_linear(top.table("linear"), recordings, locations)
     identification = read_identification(top.table("identification"), locations, terms)
-    _check_modes(file, identification, 1 if structure.kind == "oscillator" else reduction.modes or 10)
     posterior = read_posterior(top.table("posterior"))
     names = tuple(r.name for r in recordings)
     prediction = read_prediction(top.table("prediction"), locations, names)
@@ -74,8 +75,10 @@ def read_study(path: Path | str) -> Study:
     others = [linear.file] if linear.file else []
     files = dict.fromkeys([*(p for _, p in structure.files), *others, *(Path(r.file) for r in recordings)])
     inputs = tuple((_relative(p, file.parent), file_digest(p)) for p in files)
-    return Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
-                 report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan, compared)
+    study = Study(file.resolve(), title, seed, structure, reduction, recordings, linear, identification, terms, posterior, prediction,
+                  report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan, compared)
+    check_consistency(study, built)
+    return study
 
 
 def _parse(file: Path) -> dict[str, Any]:
@@ -109,13 +112,6 @@ def _check_order(file: Path, identification: bool, later: Mapping[str, object], 
     if identification and not any(r.role == "train" for r in recordings):
         raise InputError(f"{file.name}: [[recordings]]", 'none has role = "train", so there is nothing to identify from',
                          'give one of them role = "train"')
-
-
-def _check_modes(file: Path, entry: IdentificationEntry | None, count: int) -> None:
-    beyond = [k for k in entry.modes if k > count] if entry is not None else []
-    if beyond:
-        raise InputError(f"{file.name}: [identification] modes", f"mode {beyond[0]} does not exist, the model has {count}",
-                         "raise modes in [reduction], or name lower ones")
 
 
 def _read_recordings(top: Table, locations: Sequence[str], *, needed: bool = True) -> tuple[RecordingSpec, ...]:

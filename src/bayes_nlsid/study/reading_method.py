@@ -203,7 +203,7 @@ def read_posterior(table: Table | None) -> PosteriorEntry | None:
         return None
     priors = tuple(_read_prior(t) for t in table.tables("priors"))
     entry = PosteriorEntry(table.text("likelihood", "whittle", ("whittle", "plain")), table.integer("ensembles", 4, low=2),
-                           table.integer("steps", None, low=10), table.integer("most", None, low=100),
+                           table.integer("steps", None, low=10), table.integer("most", None, low=200),
                            table.integer("walkers", None, low=4), priors,
                            table.text("stage", None, ("regression", "forward", "both")))
     table.close()

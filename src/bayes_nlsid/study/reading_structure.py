@@ -10,6 +10,8 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.units import unit_factor
 from bayes_nlsid.structure.beam import LappedBeam
+from bayes_nlsid.structure.modal import ModalModel
+from bayes_nlsid.structure.structure import Structure
 from bayes_nlsid.study.building import build_structure
 from bayes_nlsid.study.schema import ReductionEntry, StructureEntry
 from bayes_nlsid.study.table import Table, nearest
@@ -25,8 +27,8 @@ _SPRINGS = ("tangential", "normal", "rotation")
 GROUPS = ("sensors", "inputs", "joints")
 
 
-def read_structure(table: Table) -> tuple[StructureEntry, tuple[str, ...]]:
-    """The structure's entry and the names of all its locations; the structure is built once to be sure that it can be.
+def read_structure(table: Table) -> tuple[StructureEntry, Structure | ModalModel]:
+    """The structure's entry and the structure itself, which is built to be sure that it can be.
 
     Raises
     ------
@@ -43,7 +45,7 @@ def read_structure(table: Table) -> tuple[StructureEntry, tuple[str, ...]]:
         raise
     except ValueError as error:
         raise InputError(f"{table.file.name}: {table.name}", str(error), "correct these values") from None
-    return entry, tuple(built.locations)
+    return entry, built
 
 
 def _beam(table: Table) -> StructureEntry:

@@ -102,7 +102,7 @@ def _drawn(context: Context, entry: CompareEntry, name: str, scenario: str, elem
     model: Model = problem.model
     if not problem.names:
         return Alternative(name, model, np.zeros((1, 0)))
-    priors = chosen_priors(asked, found, strict=False)
+    priors = chosen_priors(asked, found)
     likelihood = WhittleLikelihood(found)
     weighted = around_fit(likelihood, priors, draws=1000, seed=seed)
     if weighted.shape <= WORST_SHAPE:

@@ -34,18 +34,15 @@ def linear(context: Context) -> Result:
         model = _with_stated_damping(context, nominal)
         arrays, names = model_record(model)
         notes = [*model.notes, "no low-level recording was named"]
-        return arrays, {"model": names, "modes": [], "polarity": [], "updated": [], "notes": notes}
-    from bayes_nlsid.structure.polarity import polarity
-
+        signs = _signs(context, nominal, None)
+        return arrays, {"model": names, "modes": [], "polarity": signs, "updated": [], "notes": notes}
     wanted = tuple(k - 1 for k in study.linear.modes) or tuple(range(nominal.modes))
     measured, source = _measured(context, nominal, wanted)
-    signs = [{"channel": f.channel, "sentence": f.sentence} for f in polarity(measured, nominal)]
+    signs = _signs(context, nominal, measured)
     missing = [f"mode {k + 1}, {nominal.frequency[k]:.4g} Hz in the model, was not found in {source}: it was not "
                "excited, or the model is more than 10 % off" for k in wanted if k not in measured.nominal]
     for sentence in missing:
         context.note(sentence)
-    for sign in signs:
-        context.note(sign["sentence"])
     final, updated, notes = _updated(context, structure, measured)
     context.progress(0.8, "reducing")
     computed = reduce_structure(final, study.reduction)
@@ -75,6 +72,32 @@ def _measured(context: Context, nominal: ModalModel, wanted: tuple[int, ...]) ->
     context.progress(0.2, "identifying modes from low-level data")
     recording = _low_level(context)
     return identify_modes(recording, nominal, modes=wanted), f"recording {recording.name!r}"
+
+
+def _signs(context: Context, nominal: ModalModel, measured: IdentifiedModes | None) -> list[dict[str, Any]]:
+    """Channels that disagree with the model: among themselves over the measured modes, and in their answer to a measured force.
+
+    Where no modes were measured, those of the first recording to be fitted serve, if it is a free decay.
+    """
+    from bayes_nlsid.structure.agreement import response_findings
+    from bayes_nlsid.structure.identify import identify_modes
+    from bayes_nlsid.structure.polarity import polarity
+
+    context.progress(0.5, "comparing signs with the model")
+    entry, trained = context.study.identification, context.role("train")
+    wanted = [k - 1 for k in entry.modes] if entry is not None else list(range(nominal.modes))
+    if measured is None and trained and trained[0].free and len(trained[0].channels) > 1:
+        low = [k for k in wanted if nominal.frequency[k] < 0.4 * trained[0].fs]
+        measured = identify_modes(trained[0], nominal, modes=low) if low else None
+    found = [] if measured is None else list(polarity(measured, nominal))
+    forced = [r for r in (*([_low_level(context)] if context.study.linear.recording is not None else []), *trained) if not r.free]
+    if forced:
+        known = {f.channel for f in found}
+        again = response_findings(forced[0], nominal, wanted, scale=entry is None or not entry.free_gain)
+        found += [f for f in again if f.kind == "scaled" or f.channel not in known]
+    for finding in found:
+        context.note(finding.sentence)
+    return [{"channel": f.channel, "sentence": f.sentence} for f in found]
 
 
 def _updated(context: Context, structure: Structure | ModalModel, measured: Any) -> tuple[Any, list[dict[str, Any]], list[str]]:

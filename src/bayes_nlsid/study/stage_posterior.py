@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from bayes_nlsid.inference.likelihood import Likelihood, PlainLikelihood, Whittl
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
 from bayes_nlsid.inference.reweighting import forward_posterior
+from bayes_nlsid.study.consistency import same_parameter
 from bayes_nlsid.study.context import Context, Result
 from bayes_nlsid.study.schema import PosteriorEntry
 from bayes_nlsid.study.stage_identify import stored_fit
@@ -47,6 +47,9 @@ def posterior(context: Context) -> Result:
         return {"theta": np.zeros((1, 0, 1, 0)), "log_prob": np.zeros((1, 0, 1)), "quantiles": np.zeros((3, 0)), "narrowing": np.zeros(0),
                 "ess": np.zeros(0), "tau": np.zeros(0)}, _empty()
     priors = chosen_priors(context, start)
+    if entry.walkers is not None and entry.walkers < 2 * len(priors):
+        raise InputError(f"{context.study.file.name}: [posterior] walkers", f"{entry.walkers} are too few for {len(priors)} parameters",
+                         f"write {4 * len(priors)} or more, or leave it out")
     stage, why = chosen_stage(context, entry, start)
     found: Posterior | None = None
     arrays: dict[str, Any] = {}
@@ -159,21 +162,20 @@ def _likelihood(entry: PosteriorEntry, start: Fit) -> Likelihood:
     return WhittleLikelihood(start) if entry.likelihood == "whittle" else PlainLikelihood(start)
 
 
-def chosen_priors(context: Context, start: Fit, strict: bool = True) -> tuple[Prior, ...]:
-    """The default priors with those of the study in their place; ``strict``: every one of the study must name a parameter.
+def chosen_priors(context: Context, start: Fit) -> tuple[Prior, ...]:
+    """The default priors with those of the study in their place; one for a term that was not chosen waits for another day.
 
     Raises
     ------
     InputError
-        If a pattern names no parameter, or a prior does not fit its bounds.
+        If a prior does not fit its bounds.
     """
     out = list(default_priors(start.problem))
     for i, stated in enumerate(context.study.posterior.priors if context.study.posterior is not None else ()):
         where = f"{context.study.file.name}: [[posterior.priors]] {i + 1}"
-        matched = [k for k, p in enumerate(out) if p.name == stated.parameter or fnmatchcase(p.name, stated.parameter.replace("[", "[[]"))]
-        if not matched and strict:
-            raise InputError(where, f"{stated.parameter!r} is none of the parameters {', '.join(p.name for p in out[:8])}",
-                             "correct the name")
+        matched = [k for k, p in enumerate(out) if same_parameter(stated.parameter, p.name)]
+        if not matched:
+            context.note(f"the prior of {stated.parameter} is not used: the terms that were chosen have no such parameter")
         for k in matched:
             lower = out[k].lower if stated.lower is None else max(stated.lower, out[k].lower)
             upper = out[k].upper if stated.upper is None else min(stated.upper, out[k].upper)

@@ -18,6 +18,7 @@ from bayes_nlsid.recordings.recording import SI_UNIT, Recording
 from bayes_nlsid.study.context import Arrays, Context, Result
 from bayes_nlsid.study.schema import PredictionEntry
 from bayes_nlsid.study.stage_identify import band_of, observed, stored_model
+from bayes_nlsid.study.stage_read import refuse_driven
 
 LOOP_SAMPLES = 200
 AROUND = (0.5, 1.6)
@@ -110,6 +111,7 @@ def _displacement(context: Context, recording: Recording, at: str) -> tuple[Arra
 def _measured(context: Context, entry: PredictionEntry) -> Arrays:
     """The backbone read directly from a recorded decay."""
     assert entry.measured is not None
+    refuse_driven(context, context.recordings[entry.measured])
     time, displacement = _displacement(context, context.recordings[entry.measured], entry.at)
     found = measured_backbone(time, displacement, _mode_band(context, entry), location=entry.at)
     if found.status != "ok":

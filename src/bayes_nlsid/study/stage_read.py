@@ -16,6 +16,8 @@ from bayes_nlsid.recordings.recording import SI_UNIT, Recording
 from bayes_nlsid.study.axes import thinned
 from bayes_nlsid.study.context import Arrays, Context, Result, same_sensors
 
+DRIVEN = 0.1
+"""Largest force in the second half of a free decay over that in the first, where a hammer may have struck."""
 MOST = 400_000
 """Samples of a recording that are kept for its picture."""
 
@@ -68,6 +70,20 @@ def refuse_dead(context: Context, recording: Recording, findings: Sequence[Mappi
         if finding["kind"] == "dead" and finding["channel"] in responses:
             where = f"{context.study.file.name}: recording {recording.name!r}, channel {finding['channel']!r}"
             raise InputError(where, finding["sentence"], "correct the array or column, or drop the channel")
+
+
+def refuse_driven(context: Context, recording: Recording) -> None:
+    """A backbone is read from a motion that decays freely.
+
+    Raises
+    ------
+    InputError
+        If the recorded force is still at work in the second half of the record.
+    """
+    early, late = (float(np.abs(part).max()) if part.size else 0.0 for part in np.array_split(recording.force, 2))
+    if late > DRIVEN * early:
+        raise InputError(f"{context.study.file.name}: [prediction] measured",
+                         f"recording {recording.name!r} is driven to its end", "name a free decay, or a window of one")
 
 
 def describe(recording: Recording, floor: NoiseFloor) -> dict[str, Any]:

@@ -1,0 +1,133 @@
+"""What one table of a study says, held against the others, before anything is computed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+from bayes_nlsid.errors import InputError
+from bayes_nlsid.structure.modal import ModalModel
+from bayes_nlsid.structure.structure import Structure
+from bayes_nlsid.study.building import library
+from bayes_nlsid.study.reading_structure import GROUPS
+from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.table import nearest
+
+
+def check_consistency(study: Study, built: Structure | ModalModel) -> None:
+    """Modes, parts, masters, records and parameters that are named must exist and serve the purpose they are named for.
+
+    Parameters
+    ----------
+    study : Study
+    built : Structure or ModalModel
+        The structure that the study describes.
+
+    Raises
+    ------
+    InputError
+        On the first contradiction.
+    """
+    where = study.file.name
+    _check_modes(study, built, where)
+    _check_parts(study, built, where)
+    _check_roles(study, where)
+    _check_priors(study, where)
+
+
+def _check_modes(study: Study, built: Structure | ModalModel, where: str) -> None:
+    count = built.modes if isinstance(built, ModalModel) else min(study.reduction.modes or 10, len(built.dofs))
+    asked: list[tuple[str, Sequence[int]]] = [("linear", study.linear.modes)]
+    if study.identification is not None:
+        asked.insert(0, ("identification", study.identification.modes))
+    asked += [(name, (entry.mode,)) for name, entry in (("prediction", study.prediction), ("montecarlo", study.montecarlo))
+              if entry is not None]
+    for table, modes in asked:
+        key = "modes" if table in ("identification", "linear") else "mode"
+        beyond = [k for k in modes if k > count]
+        if beyond:
+            mend = "name lower ones" if isinstance(built, ModalModel) else "raise modes in [reduction], or name lower ones"
+            raise InputError(f"{where}: [{table}] {key}", f"mode {beyond[0]} does not exist, the model has {count}", mend)
+    if len(study.linear.damping) > count:
+        raise InputError(f"{where}: [linear] damping", f"{len(study.linear.damping)} ratios are given for {count} mode{'s'[:count > 1]}",
+                         "give fewer")
+
+
+def _check_parts(study: Study, built: Structure | ModalModel, where: str) -> None:
+    if isinstance(built, ModalModel):
+        if study.linear.update:
+            raise InputError(f"{where}: [linear] update", "an oscillator has no parts to update",
+                             "remove update; its frequency and damping are measured directly")
+        return
+    known = list(dict.fromkeys((*built.K_parts, *built.M_parts)))
+    named = [part for _, parts in study.linear.update for part in parts]
+    for part in named:
+        if part not in known:
+            raise InputError(f"{where}: [linear] update", f"{part!r} is not a part of the structure", nearest(part, known))
+        if named.count(part) > 1:
+            raise InputError(f"{where}: [linear] update", f"{part!r} stands in two groups", "name each part once")
+    if study.reduction.method != "none":
+        places = (*GROUPS, *built.locations)
+        for name in study.reduction.masters:
+            if name not in places:
+                raise InputError(f"{where}: [reduction] masters", f"{name!r} is neither a group nor a location", nearest(name, places))
+
+
+def _check_roles(study: Study, where: str) -> None:
+    """Records that judge a prediction must not have been fitted; a backbone needs a sensor where it is drawn."""
+    prediction = study.prediction
+    if prediction is None:
+        return
+    recordings = {r.name: r for r in study.recordings}
+    for name in prediction.heldout:
+        role = recordings[name].role
+        if role in ("train", "noise"):
+            why = "is fitted, so it cannot judge the fit" if role == "train" else "was taken with the excitation off"
+            raise InputError(f"{where}: [prediction] heldout", f"recording {name!r} has role = {role!r}: it {why}",
+                             'name one of role = "holdout"')
+    if prediction.measured is not None:
+        found = recordings[prediction.measured]
+        if found.role == "noise":
+            raise InputError(f"{where}: [prediction] measured", f"recording {found.name!r} was taken with the excitation off",
+                             "name a free decay")
+        sensors = [c.location for c in found.channels if c.quantity != "force"]
+        if prediction.at not in sensors:
+            raise InputError(f"{where}: [prediction] measured", f"recording {found.name!r} has no channel at {prediction.at!r}",
+                             f"choose at among {', '.join(sensors)}")
+
+
+def _check_priors(study: Study, where: str) -> None:
+    if study.posterior is None or study.identification is None:
+        return
+    walkers = study.posterior.walkers
+    if walkers is not None and (walkers < 8 or walkers % 2):
+        raise InputError(f"{where}: [posterior] walkers", f"{walkers} is not an even number from 8 up", "leave it out, or write 32 or more")
+    possible = list(dict.fromkeys(_parameters(study)))
+    for i, prior in enumerate(study.posterior.priors, start=1):
+        if not any(same_parameter(prior.parameter, name) for name in possible):
+            anywhere = list(dict.fromkeys(re.sub(r"\[.*[^0-9].*\]", "[*]", name) for name in possible))
+            raise InputError(f"{where}: [[posterior.priors]] {i} parameter",
+                             f"{prior.parameter!r} is none of the parameters that this study can have", nearest(prior.parameter, anywhere))
+
+
+def same_parameter(pattern: str, name: str) -> bool:
+    """Whether a name of a study, in which ``*`` stands for any part, means a parameter."""
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
+
+
+def _parameters(study: Study) -> Iterator[str]:
+    """Every name that a parameter can have, whichever terms are chosen: ``f[1]``, ``cubic[J1].c``, tied places joined by ``+``."""
+    entry: Any = study.identification
+    yield from (f"{kind}[{k}]" for kind in ("f", "zeta") for k in entry.free_modes)
+    if entry.free_gain:
+        yield "gain"
+    terms = library(study.terms)
+    places = ["+".join(entry.joints)] if entry.tied else list(entry.joints)
+    for name in entry.candidates:
+        yield from (f"{name}[{place}].{p.name}" for place in places for p in terms[name].params)
+    for element in entry.elements:
+        at = ["+".join(element.locations)] if element.tied else list(element.locations)
+        fixed = {key for key, _ in element.fixed}
+        yield from (f"{element.term}[{place}].{p.name}" for place in at for p in terms[element.term].params if p.name not in fixed)
