@@ -39,6 +39,26 @@ def test_missed_records_are_said_with_numbers() -> None:
     assert "inadequate" in summary(found, Path("nowhere")).splitlines()[0]
 
 
+def test_doubtful_channels_stand_before_the_numbers_that_rest_on_them() -> None:
+    found = result(0.9)
+    assert "Beware" not in told(found) and "beware" not in summary(found, Path("nowhere"))
+    clipped = {"severity": "error", "channel": "a", "sentence": "is clipped", "mend": "measure again", "kind": "clipping"}
+    found |= {"recordings": [{"name": "loud", "findings": [clipped, {**clipped, "severity": "note", "sentence": "is odd"}]}],
+              "linear": {"polarity": [{"channel": "b", "sentence": "b is inverted"}]}}
+    words = told(found)
+    assert "loud, channel a: is clipped; measure again. b is inverted." in words and "is odd" not in words
+    assert words.index("Beware") < words.index("determine") and summary(found, Path("nowhere")).count("beware") == 2
+
+
+def test_the_screen_names_the_laws_or_that_there_are_none() -> None:
+    found = result(0.9)
+    score = {"mse": 1.0, "mse_linear": 50.0, "floor": 0.5}
+    found["selection"] = {"forward": [2], "terms": [{"name": "cubic", "index": 2, "locations": ["J1", "J2", "J3"]}], "score": score}
+    assert "found: cubic at J1 … J3 was chosen from the library, removing 98.0 %" in summary(found, Path("nowhere"))
+    found["selection"] = {"forward": [], "terms": [], "score": score}
+    assert "found: No force law of the library explains more" in summary(found, Path("nowhere"))
+
+
 @pytest.mark.parametrize("coverage", [0.76, 0.9, 1.0])
 def test_a_band_that_holds_is_not_called_inadequate(coverage: float) -> None:
     found = result(coverage)

@@ -371,7 +371,7 @@ class _Run:
         convergence = self._assess(s, value, accepted)
         thin = max(1, s[..., 0].size // KEEP)
         failed = [b.failed_at for row in self.blocks for b in row if len(b.failed_at)]
-        if self.progress is not None:
+        if self.progress is not None and not self.stopped:
             self.progress(1.0, f"{convergence.status}: {s.shape[1]} steps of {s.shape[0]} ensembles after {first * self.block} of burn-in")
         return Posterior(problem.names, tuple(p.unit for p in problem.model.parameters), self.target.to_theta(s[:, thin - 1::thin]),
                          value[:, thin - 1::thin], convergence, priors, seed, self.target.likelihood.describe(), first * self.block,

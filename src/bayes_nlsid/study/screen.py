@@ -9,7 +9,7 @@ from typing import Any
 from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent
 from bayes_nlsid.study.schema import Study
 from bayes_nlsid.study.stage_read import told
-from bayes_nlsid.study.story import status_words
+from bayes_nlsid.study.story import doubts, found_words, status_words
 
 WIDTH = 100
 
@@ -31,9 +31,11 @@ def _wrapped(text: str) -> str:
 
 
 def summary(result: Mapping[str, Any], out: Path) -> str:
-    """One screen: what was found, parameters with 5/50/95 %, convergence, held-out error, files."""
+    """One screen: which force laws were found, parameters with 5/50/95 %, convergence, held-out error, files."""
     parts = [f"{result['title']}: {status_words(result)}"]
     parts += [_wrapped(f"  reason: {brief(reason)}") for reason in result["reasons"][:4]]
+    if result.get("selection") is not None:
+        parts.append(_wrapped(f"  found: {brief(found_words(result))}"))
     rows = []
     parameters = result.get("parameters", [])
     for p, name in zip(parameters, brief_names([p["name"] for p in parameters]), strict=True):
@@ -84,10 +86,7 @@ def extra_summary(name: str, result: Mapping[str, Any], out: Path) -> str:
 
 
 def _beware(result: Mapping[str, Any], most: int = 4) -> list[str]:
-    """What is wrong with channels, which no figure above shows: errors found in recordings, signs against the linear model."""
-    said = [told(r["name"], f) for r in result.get("recordings", []) for f in r["findings"] if f["severity"] == "error"]
-    said += [p["sentence"] for p in result.get("linear", {}).get("polarity", [])]
-    said = list(dict.fromkeys(said))
+    said = doubts(result)
     more = [f"  ... and {len(said) - most} more in the report"] if len(said) > most else []
     return [_wrapped(f"  beware: {text}") for text in said[:most]] + more
 

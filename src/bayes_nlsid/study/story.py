@@ -7,6 +7,7 @@ from typing import Any
 
 from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering, floor_text, percent, places
 from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.stage_read import told
 
 STATUS_WORDS = {"ok": "done", "not_converged": "refused: the sampler has not converged", "not_identifiable": "refused: not identifiable",
                 "model_misfit": "refused: the model does not explain the recordings", "failed": "refused: the computation failed"}
@@ -50,13 +51,14 @@ def _covered(result: Mapping[str, Any]) -> str:
 
 def story(study: Study, result: Mapping[str, Any]) -> list[str]:
     """A handful of sentences, each from ``result.json`` alone."""
-    tellers = (_found, _cut_off, _against_alternatives, _sure, _two_stages, _backbone, _heldout, _inadequate)
+    tellers = (found_words, _doubtful, _cut_off, _against_alternatives, _sure, _two_stages, _backbone, _heldout, _inadequate)
     out = [sentence for sentence in (tell(result) for tell in tellers) if sentence]
     out += list(study.report.notes)
     return [*out, _next(result)]
 
 
-def _found(result: Mapping[str, Any]) -> str:
+def found_words(result: Mapping[str, Any]) -> str:
+    """What was chosen, and how much of what the linear model leaves unexplained it removes."""
     chosen = result.get("selection")
     if chosen is None:
         modes = result.get("linear", {}).get("modes", [])
@@ -72,6 +74,19 @@ def _found(result: Mapping[str, Any]) -> str:
     way = f"{verb} chosen from the library" if chosen["forward"] else f"{verb} given as the form"
     left = f"; what is left is {score['mse'] / score['floor']:.3g} times what sensor noise alone would leave" if score.get("floor") else ""
     return f"{terms} {way}, removing {share:.1f} % of what the linear model leaves unexplained{left}."
+
+
+def doubts(result: Mapping[str, Any]) -> list[str]:
+    """What is wrong with channels, which no figure shows: errors found in recordings, signs and sizes against the linear model."""
+    said = [told(r["name"], f) for r in result.get("recordings", []) for f in r["findings"] if f["severity"] == "error"]
+    said += [p["sentence"] for p in result.get("linear", {}).get("polarity", [])]
+    return list(dict.fromkeys(said))
+
+
+def _doubtful(result: Mapping[str, Any], most: int = 3) -> str:
+    said = doubts(result)
+    more = f" And {len(said) - most} more, below." if len(said) > most else ""
+    return f"Beware, all that follows rests on these recordings: {'. '.join(said[:most])}.{more}" if said else ""
 
 
 def _cut_off(result: Mapping[str, Any]) -> str:
