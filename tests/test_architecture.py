@@ -24,6 +24,7 @@ LINES = 420
 BODY = 70
 
 
+@cache
 def rooms() -> list[str]:
     """The order of the rooms, from the table in the documentation."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -42,22 +43,24 @@ def room_of(path: Path) -> str:
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+def nodes_of(path: Path) -> tuple[ast.AST, ...]:
+    """Everything in the syntax tree of a file."""
+    return tuple(ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))))
 
 
-def imports(tree: ast.AST, path: Path) -> set[str]:
+@cache
+def imports(path: Path) -> frozenset[str]:
     """Every module that a file imports, anywhere in it, with relative imports spelled out."""
     package = ["bayes_nlsid", *path.relative_to(PACKAGE).parts[:-1]]
     out: set[str] = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             out |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = package[:len(package) - node.level + 1] if node.level else []
             module = ".".join([*base, *([node.module] if node.module else [])])
             out |= {module} | ({f"{module}.{a.name}" for a in node.names} if module == "bayes_nlsid" else set())
-    return out
+    return frozenset(out)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
@@ -68,7 +71,7 @@ def test_imports_point_to_earlier_rooms(path: Path) -> None:
         return
     assert own in order, f"{own} is not in the table of rooms in docs/architecture.md"
     allowed = set(order[:order.index(own) + 1])
-    for module in imports(tree_of(path), path):
+    for module in imports(path):
         parts = module.split(".")
         if parts[0] == "bayes_nlsid" and len(parts) > 1 and parts[1] != "__version__":
             assert parts[1] in allowed, f"{relative(path)} imports {module}, which stands below it"
@@ -76,7 +79,7 @@ def test_imports_point_to_earlier_rooms(path: Path) -> None:
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_heavy_packages_stand_where_they_may(path: Path) -> None:
-    tops = {module.split(".")[0] for module in imports(tree_of(path), path)}
+    tops = {module.split(".")[0] for module in imports(path)}
     for name, where in ALLOWED.items():
         if name in tops:
             assert where.fullmatch(relative(path)), f"{name} is imported in {relative(path)}"
@@ -87,7 +90,7 @@ def test_nothing_prints_and_nothing_is_a_drawer(path: Path) -> None:
     assert path.stem not in ("utils", "util", "common", "helpers", "misc")
     if relative(path) == "cli.py":
         return
-    calls = [n.lineno for n in ast.walk(tree_of(path)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name) and n.func.id == "print"]
+    calls = [n.lineno for n in nodes_of(path) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name) and n.func.id == "print"]
     assert not calls, f"print in lines {calls}"
 
 
@@ -95,7 +98,7 @@ def test_nothing_prints_and_nothing_is_a_drawer(path: Path) -> None:
 def test_sizes(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.count("\n") <= LINES, f"{relative(path)} has {text.count(chr(10))} lines"
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             first = node.body[0]
             has_doc = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
@@ -111,7 +114,7 @@ def _is_abstract(node: ast.ClassDef) -> bool:
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_every_class_is_final_or_abstract(path: Path) -> None:
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.ClassDef):
             decorators = {ast.unparse(d).split("(")[0].split(".")[-1] for d in node.decorator_list}
             assert "final" in decorators or _is_abstract(node), f"{relative(path)}: class {node.name} is neither @final nor abstract"
@@ -120,7 +123,7 @@ def test_every_class_is_final_or_abstract(path: Path) -> None:
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_random_numbers_are_explicit(path: Path) -> None:
     """numpy's global generator is hidden state: only Generator, SeedSequence and bit generators are named."""
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if (isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random"
                 and ast.unparse(node.value) in ("np.random", "numpy.random")):
             assert node.attr in ("Generator", "SeedSequence", "default_rng", "PCG64", "PCG64DXSM", "RandomState", "MT19937"), \
@@ -132,7 +135,7 @@ def test_random_numbers_are_explicit(path: Path) -> None:
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_nothing_read_is_ever_executed(path: Path) -> None:
     """No eval, exec or pickle of what a file holds; only workers unpickle, and only what their own parent sent them."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)
             assert called not in ("eval", "exec", "compile", "__import__", "builtins.eval", "builtins.exec"), f"line {node.lineno}"

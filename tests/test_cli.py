@@ -97,9 +97,12 @@ def test_ctrl_c_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     assert "run the same command again" in capsys.readouterr().err
 
 
-def test_nothing_but_the_summary_without_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_but_the_summary_without_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    from bayes_nlsid.study import pictures
     from bayes_nlsid.study.template import TEXT, write_template
 
+    monkeypatch.setattr(pictures, "draw_all", lambda *_: [])
     study = write_template(tmp_path / "s")
     study.write_text(TEXT[:TEXT.index("[identification]")], encoding="utf-8")
     assert main(["run", str(study), "--out", str(tmp_path / "out"), "--log", str(tmp_path / "more.log")]) == 0

@@ -20,10 +20,22 @@ from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec, read_reco
 N, STEP = 50, 9.765625e-05  # 10240 Hz, which six printed digits do not hold
 RNG = np.random.default_rng(3)
 ACC, FORCE = RNG.normal(size=N), RNG.normal(size=N)
+WRITTEN: dict[int, bytes] = {}
 
 
 def dataset58(path: Path, binary: int = 0, **changes: Any) -> bytes:
-    """What pyuff writes for an acceleration at 12+Z and a force at 3-X."""
+    """What pyuff writes for an acceleration at 12+Z and a force at 3-X; written there too."""
+    if changes or binary not in WRITTEN:
+        data = _dataset58(path.with_suffix(".made"), binary, **changes)
+        if changes:
+            path.write_bytes(data)
+            return data
+        WRITTEN[binary] = data
+    path.write_bytes(WRITTEN[binary])
+    return WRITTEN[binary]
+
+
+def _dataset58(path: Path, binary: int, **changes: Any) -> bytes:
     if path.exists():
         path.unlink()
     for node, direction, kind, label, data in ((12, 3, 12, "m/s^2", ACC), (3, -1, 13, "N", FORCE)):

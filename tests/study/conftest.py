@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayes_nlsid.study import pictures
+from bayes_nlsid.study.reading import read_study
+from bayes_nlsid.study.run import run_study
 from bayes_nlsid.study.template import TEXT, example_recording
 
 
@@ -24,3 +27,17 @@ def small(recording: Path) -> Path:
     path = recording.parent / "small.toml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+@pytest.fixture(scope="session")
+def finished(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run of the small study leaves; to be copied, never written into."""
+    out = tmp_path_factory.mktemp("finished") / "out"
+    run_study(read_study(small), out)
+    return out
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures, where only stages and numbers are looked at."""
+    monkeypatch.setattr(pictures, "draw_all", lambda *_: [])

@@ -48,10 +48,11 @@ def measured(page: str, folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def pages(small: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pages(small: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     text = small.read_text(encoding="utf-8").replace('title = "My first study', 'title = "' + "Averylongwordwithoutanyplacetobreak" * 4)
     (small.with_name("long.toml")).write_text(text, encoding="utf-8")
+    shutil.copytree(finished / "stages", folder / "run" / "stages")  # a title changes the report alone
     run_study(read_study(small.with_name("long.toml")), folder / "run")
     assert cli.main(["plan", str(write(folder)), "--out", str(folder / "plan"), "--quiet"]) == 0
     return {"run": folder / "run" / "report.html", "plan": folder / "plan" / "plan.html"}

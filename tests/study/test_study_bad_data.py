@@ -171,7 +171,7 @@ def test_what_is_doubtful_is_told_before_and_after(make: Callable[[np.ndarray], 
     assert words in plan and "no force is recorded, and yet the motion does not decay" in plan
 
 
-def test_an_inverted_force_and_a_wrong_unit_are_told_by_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_inverted_force_and_a_wrong_unit_are_told_by_the_run(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No low-level recording is named, one sensor, one force: the sign and the size of the answer still have to be those of the model."""
     from bayes_nlsid.study.template import example_recording
 

@@ -20,7 +20,7 @@ def study(small: Path) -> Path:
     return path
 
 
-def test_from_nothing_to_the_sentence(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_nothing_to_the_sentence(study: Path, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["compare", str(study), "--out", str(out)]) == 0
     said = json.loads((out / "compare.json").read_text())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 
 from bayes_nlsid.cli import main
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.study import pictures
 from bayes_nlsid.study.reading import read_study
 
-FRF = '[frf]\ninput = "x"\noutput = "x"\nlevels = ["0.6 N", "0.05 N"]\nband = ["17 Hz", "27 Hz"]\nsamples = 20\n'
+FRF = '[frf]\ninput = "x"\noutput = "x"\nlevels = ["0.6 N", "0.05 N"]\nband = ["17 Hz", "27 Hz"]\nsamples = 8\n'
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +24,10 @@ def study(small: Path) -> Path:
     return path
 
 
-def test_from_nothing_to_the_report(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_a_run_to_the_report(study: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                  monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
+    shutil.copytree(finished / "stages", out / "stages")
     assert main(["frf", str(study), "--out", str(out)]) == 0
     assert "peak (Hz)" in capsys.readouterr().out
     with np.load(out / "frf.npz") as file:
@@ -40,6 +44,7 @@ def test_from_nothing_to_the_report(study: Path, tmp_path: Path, capsys: pytest.
     assert "Response to stepped sines" in (out / "report.html").read_text(encoding="utf-8")
     log = out / "run.log"
     log.unlink()
+    monkeypatch.setattr(pictures, "draw_all", lambda *_: [])
     # again, on two processes: nothing is computed; then a plain run keeps the section
     assert main(["frf", str(study), "--out", str(out), "--workers", "2", "--quiet"]) == 0
     assert log.read_text().count("taken from an earlier run") == 4
@@ -66,9 +71,9 @@ def test_a_study_without_the_table_is_refused(small: Path, tmp_path: Path, capsy
     ('["0.6 N", "0.05 N"]', "[-1.0]", ["levels", "above zero"]),
     ('["17 Hz", "27 Hz"]', '["27 Hz", "17 Hz"]', ["band", "lower to a higher"]),
     ('["17 Hz", "27 Hz"]', '["0 Hz", "17 Hz"]', ["band", "begins at zero"]),
-    ("samples = 20", "samples = 1", ["samples", "out of range"]),
-    ("samples = 20", "harmonics = 0", ["harmonics", "out of range"]),
-    ("samples = 20", "sample = 20", ["sample", "did you mean 'samples'"]),
+    ("samples = 8", "samples = 1", ["samples", "out of range"]),
+    ("samples = 8", "harmonics = 0", ["harmonics", "out of range"]),
+    ("samples = 8", "sample = 8", ["sample", "did you mean 'samples'"]),
 ])
 def test_mistakes_in_the_table(right: str, wrong: str, words: list[str], study: Path) -> None:
     path = study.parent / "wrong.toml"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,6 @@ import pytest
 
 from bayes_nlsid.cli import main
 from bayes_nlsid.errors import InputError
-from bayes_nlsid.study import pictures
 from bayes_nlsid.study.reading import read_study
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,8 +47,9 @@ def study(small: Path) -> Path:
     return path
 
 
-def test_from_nothing_to_the_report(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_a_run_to_the_report(study: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
+    shutil.copytree(finished / "stages", out / "stages")
     assert main(["montecarlo", str(study), "--out", str(out)]) == 0
     assert "first order" in capsys.readouterr().out
     said = json.loads((out / "montecarlo.json").read_text())
@@ -71,9 +72,8 @@ def test_from_nothing_to_the_report(study: Path, tmp_path: Path, capsys: pytest.
         p.name for p in (out / "figures").iterdir()}
 
 
-def test_samples_of_a_posterior(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "draw_all", lambda *arguments: [])
-    text = small.read_text(encoding="utf-8") + "[posterior]\nsteps = 60\nmost = 400\n"
+def test_samples_of_a_posterior(small: Path, quick: None, tmp_path: Path) -> None:
+    text = small.read_text(encoding="utf-8") + '[posterior]\nstage = "regression"\nensembles = 2\nsteps = 60\nmost = 400\n'
     path = tmp_path / "posterior.toml"
     text = text.replace("recording.npz", str(small.parent / "recording.npz")) + TABLE[:TABLE.index("source")]
     path.write_text(text + "samples = 300\n", encoding="utf-8")

@@ -23,21 +23,6 @@ ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 
 
-@pytest.fixture(scope="module")
-def finished(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("finished") / "out"
-    run_study(read_study(small), out)
-    return out
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No figures, where only stages and numbers are looked at."""
-    from bayes_nlsid.study import pictures
-
-    monkeypatch.setattr(pictures, "draw_all", lambda *_: [])
-
-
 def timeless(out: Path) -> dict[str, Any]:
     """What must be the same however often a run was interrupted."""
     result = json.loads((out / "result.json").read_text())
@@ -107,9 +92,10 @@ def test_another_seed_redoes_what_draws(small: Path, finished: Path, quick: None
 KILLER = """
 import os, sys
 from pathlib import Path
-from bayes_nlsid.study import run
+from bayes_nlsid.study import pictures, run
 from bayes_nlsid.study.reading import read_study
 stage = sys.argv[3]
+pictures.draw_all = lambda *_: []
 real = run._stage
 def fatal(name):
     def stage_function(context):
@@ -201,7 +187,7 @@ def test_report_page_stands_alone(finished: Path) -> None:
         assert words in page, words
 
 
-def test_report_escapes_what_users_write(small: Path, tmp_path: Path) -> None:
+def test_report_escapes_what_users_write(small: Path, quick: None, tmp_path: Path) -> None:
     text = small.read_text(encoding="utf-8").replace('title = "My first study', 'title = "<script>alert(1)</script> A & B')
     changed = small.with_name("escaped.toml")
     changed.write_text(text[:text.index("[identification]")], encoding="utf-8")
