@@ -46,8 +46,8 @@ def test_moves_leave_a_gaussian_as_it_is(scale):
     for chosen in ([(_snooker_class()(), 1.0)], moves()):
         sampler = emcee.EnsembleSampler(40, 4, lambda x: -0.5 * np.sum((x / scale) ** 2, axis=1), moves=chosen, vectorize=True)
         start = emcee.State(scale * np.random.default_rng(0).normal(size=(40, 4)), random_state=np.random.RandomState(1).get_state())
-        sampler.run_mcmc(start, 2000)
-        draws = sampler.get_chain(discard=300, flat=True) / scale
+        sampler.run_mcmc(start, 1200)
+        draws = sampler.get_chain(discard=200, flat=True) / scale
         assert draws.var(axis=0) == pytest.approx(np.ones(4), abs=0.2)
         assert draws.mean(axis=0) == pytest.approx(np.zeros(4), abs=0.15)
 
@@ -59,7 +59,7 @@ def test_a_known_gaussian_is_recovered_and_a_wrong_one_is_not():
     assert found.status == "ok" and found.convergence.rhat_max < 1.01 and found.convergence.ess_min > 400
     assert x.mean(axis=0) == pytest.approx([0.2, -0.1], abs=0.004)
     assert x.std(axis=0) == pytest.approx([0.03, 0.05], rel=0.06)
-    wrong = settled(Written(start, lambda t: gaussian(t) / 2), start, steps=400, ensembles=2).flat / start.problem.bounds[:, 1]
+    wrong = settled(Written(start, lambda t: gaussian(t) / 2), start, steps=150, ensembles=2).flat / start.problem.bounds[:, 1]
     assert (wrong.std(axis=0) > 1.25 * np.array([0.03, 0.05])).all()    # the check above can fail
 
 
@@ -74,7 +74,7 @@ def test_posterior_of_a_coefficient_in_closed_form():
     information = np.sum(w * column**2) + 1 / prior.b**2
     mean, sd = -np.sum(w * column * base) / information, information**-0.5
     assert abs(mean) < 0.5 * prior.upper      # truncation plays no part
-    found = sample(start, likelihood=likelihood, seed=1, ensembles=2, steps=600)
+    found = sample(start, likelihood=likelihood, seed=1, ensembles=2, steps=400)
     assert found.status == "ok"
     assert found.flat.mean() == pytest.approx(mean, abs=0.1 * sd)
     assert found.flat.std() == pytest.approx(sd, rel=0.08)
@@ -88,7 +88,7 @@ def test_the_posterior_does_not_depend_on_c():
     for c in (1.0, 20 * bound):
         start = lend(1, c)
         likelihood = Written(start, lambda x: -0.5 * ((x[:, 0] - 0.06) / 0.03) ** 2)
-        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=400, most=800)
+        found = sample(start, likelihood=likelihood, seed=2, ensembles=2, steps=250, most=800, block=50)
         quantiles.append(found.quantiles([0.16, 0.5, 0.84])[:, 0] / start.problem.bounds[0, 1])
         assert found.convergence.rhat_max < 1.05
     sd = 0.5 * (quantiles[1][2] - quantiles[1][0])
@@ -98,7 +98,7 @@ def test_the_posterior_does_not_depend_on_c():
 
 def test_resumed_runs_are_the_same_to_the_last_bit(tmp_path):
     start = lend(2)
-    options = {"steps": 150, "block": 50, "ensembles": 2, "most": 800}
+    options = {"steps": 50, "block": 50, "ensembles": 2, "most": 800}
     whole = settled(Written(start, gaussian), start, **options)
     calls = []
     part = settled(Written(start, gaussian), start, store=tmp_path, stop=lambda: calls.append(1) or len(calls) == 5, **options)
@@ -179,7 +179,7 @@ def test_two_modes_far_apart_are_flagged_or_joined(monkeypatch):
 
     scatter = 1e-4 * np.random.default_rng(0).normal(size=(2, 20, 1))
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
-    same = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
+    same = settled(Written(start, two), start, ensembles=2, steps=200, most=1200)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
     joined = settled(Written(start, two), start, ensembles=2, steps=600, most=1400)
     monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
@@ -215,10 +215,10 @@ def test_stuck_walkers_are_redrawn_in_burn_in_and_counted(monkeypatch):
     points = 0.2 + 0.01 * np.random.default_rng(0).normal(size=(2, 20, 2))
     points[:, 0] = -0.9
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(points))
-    freed = settled(Written(start, trap), start, ensembles=2, steps=400)
+    freed = settled(Written(start, trap), start, ensembles=2, steps=200)
     assert freed.convergence.stuck_walkers == 0    # a proposal from the mixture frees it
     monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
-    found = settled(Written(start, trap), start, ensembles=2, steps=400)
+    found = settled(Written(start, trap), start, ensembles=2, steps=200)
     assert found.convergence.stuck_walkers == 2
     assert (found.flat > 0).all()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -98,11 +99,12 @@ def _start(curve: Curve, i: int, w: float) -> np.ndarray:
 
 
 def _integrated(start: np.ndarray, w: float, level: float, periods: int) -> np.ndarray:
-    omega = INTERACTING.linear.omega
+    one, two = INTERACTING.linear.omega.tolist()
 
-    def slope(t: float, y: np.ndarray) -> np.ndarray:
-        pull = level * np.cos(w * t) - C * (y[0] + y[1]) ** 3
-        return np.concatenate([y[2:], pull - 0.006 * omega * y[2:] - omega**2 * y[:2]])
+    def slope(t: float, y: np.ndarray) -> tuple[float, ...]:
+        a, b, va, vb = y.tolist()
+        pull = level * math.cos(w * t) - C * (a + b) ** 3
+        return va, vb, pull - 0.006 * one * va - one**2 * a, pull - 0.006 * two * vb - two**2 * b
 
     at = 2 * np.pi / w * np.arange(periods + 1)
     return np.asarray(solve_ivp(slope, (0, at[-1]), start, method="DOP853", rtol=1e-12, atol=1e-15, t_eval=at).y.T)
