@@ -149,7 +149,8 @@ def test_weights_around_the_optimum_and_chains_agree(one: tuple[np.ndarray, Forw
     likelihood = one[1]
     priors = CASE.priors(likelihood.problem)
     quick = around_optimum(likelihood, priors, 400, 0)
-    found, weighted = forward_posterior(Surrogate(likelihood).fit, likelihood, priors, draws=500, ensembles=2, walkers=20, steps=800, seed=1)
+    found, weighted = forward_posterior(Surrogate(likelihood).fit, likelihood, priors, draws=500, ensembles=2, walkers=20, steps=800,
+                                        seed=1)
     assert quick.shape < 0.7 and weighted.shape < 0.7 and found.status == "ok", found.reasons
     sd = found.flat.std(axis=0)
     assert np.abs((found.quantiles()[1] - quick.quantiles([0.5])[0]) / sd).max() < 0.3

@@ -44,6 +44,13 @@ def test_finds_what_made_the_recording(finished: Path) -> None:
     assert values["cubic[x].c"] == pytest.approx(4e8, rel=0.1)
 
 
+def test_the_integration_states_its_band_and_error(finished: Path) -> None:
+    """Noise of 0.2 % outside the band is what the example has; a periodic window has no edges."""
+    (row,) = json.loads((finished / "stages" / "identify" / "data.json").read_text())["motion"]
+    assert row["record"] == "multisine" and row["band_hz"] == [5.0, 80.0] and row["channels"] == ["x"]
+    assert 0 <= row["span_s"][0] < row["span_s"][1] <= 4.0 and 1e-5 < row["error"][0] < 0.02
+
+
 def test_contract_files(finished: Path) -> None:
     assert {"result.json", "report.html", "run.log", "figures", "stages"} <= {p.name for p in finished.iterdir()}
     result = timeless(finished)
@@ -183,7 +190,7 @@ def test_report_page_stands_alone(finished: Path) -> None:
     Walker().feed(page.replace("<!doctype html>", ""))
     assert not opened
     for words in ("cubic at x was chosen", "prefers-color-scheme: dark", "@media print", "SHA-256", "stages/identify", "Next:",
-                  "width=device-width"):
+                  "width=device-width", "band and error of the integration"):
         assert words in page, words
 
 

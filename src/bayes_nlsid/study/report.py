@@ -129,7 +129,18 @@ def _selection(report: Report) -> str:
     if steps:
         steps_table = html.table(["form", "round", "candidate", "mean square", "accepted", "why"], steps, "stages/identify", numeric=(3,))
         out += f"<details open><summary>Every round of the selection</summary>{steps_table}</details>"
+    out += _motion(saved.data.get("motion", ()))
     return out + "".join(_alike(record["name"], record["aliases"]) for record in saved.data["variants"] if record.get("aliases"))
+
+
+def _motion(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How far displacement and velocity, integrated from what was measured, are to be trusted."""
+    if not rows:
+        return ""
+    cells = [[row["record"], f"{row['band_hz'][0]:.4g}–{row['band_hz'][1]:.4g} Hz", f"{row['span_s'][0]:.3g}–{row['span_s'][1]:.3g} s",
+              ", ".join(f"{name} {percent(error)}" for name, error in zip(row["channels"], row["error"], strict=True))] for row in rows]
+    head = ["record", "motion seen in", "without edge effects", "estimated error of the motion of each channel"]
+    return html.details("From recordings to motion: band and error of the integration", html.table(head, cells, "stages/identify"))
 
 
 def _alike(form: str, aliases: Sequence[str], most: int = 6) -> str:

@@ -15,6 +15,7 @@ from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.scenario import Scenario, scenario
 from bayes_nlsid.identification.select import Selection, select
 from bayes_nlsid.model import Element, Model
+from bayes_nlsid.recordings.kinematics import kinematics
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 from bayes_nlsid.structure.sensing import modal_data
 from bayes_nlsid.study.building import build_element, element_from, element_record
@@ -119,7 +120,21 @@ def identify(context: Context) -> Result:
         records.append(record)
         arrays |= {f"{v}.{name}": value for name, value in extra.items()}
     return arrays, {"variants": records, "band_hz": list(band_of(context, context.model)), "scenario": entry.scenario,
-                    "records": [d.name for d in data], "condition": max(d.condition for d in data)}
+                    "records": [d.name for d in data], "condition": max(d.condition for d in data),
+                    "motion": _integrated(context)}
+
+
+def _integrated(context: Context) -> list[dict[str, Any]]:
+    """What became of the channels on the way to displacement and velocity: band, stretch without edge effects, estimated error."""
+    entry = entry_of(context)
+    rows = []
+    for recording in context.role("train"):
+        for band in dict.fromkeys(entry.mode_bands or (band_of(context, context.model),)):
+            found = kinematics(recording, band, entry.rate)
+            span = [found.valid.start * found.dt, found.valid.stop * found.dt]
+            rows.append({"record": recording.name, "band_hz": list(band), "span_s": span,
+                         "channels": [c.name for c in found.channels], "error": found.error.tolist()})
+    return rows
 
 
 def _variant(context: Context, variant: AlternativeEntry, data: tuple[ModalData, ...], progress: Any) -> tuple[dict[str, Any], Arrays]:
