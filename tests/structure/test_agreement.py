@@ -85,6 +85,13 @@ def test_the_likely_unit_is_named_and_an_unknown_gain_is_no_finding() -> None:
     assert findings(in_g, scale=False) == []
 
 
+def test_a_force_and_a_response_that_were_exchanged_are_named() -> None:
+    right = recorded()
+    wrong = replace(right, response=right.force, force=right.response[:, 1:2], channels=right.channels[1:2])
+    (found,) = response_findings(wrong, MODEL)
+    assert (found.channel, found.kind, found.other) == ("c2", "swapped", "hammer")
+
+
 def test_what_is_not_the_same_motion_is_not_compared() -> None:
     right, rng = recorded(), np.random.default_rng(3)
     noise = replace(right, response=-50 * rng.standard_normal(right.response.shape))

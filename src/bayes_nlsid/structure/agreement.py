@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -54,14 +54,31 @@ def response_findings(recording: Recording, model: ModalModel, modes: Sequence[i
     Returns
     -------
     tuple of PolarityFinding
-        Kind ``"inverted"`` or ``"scaled"``; empty without a force, or where nothing correlates.
+        Kind ``"inverted"``, ``"scaled"``, or ``"swapped"`` for a force and a response that were exchanged; empty without a force, or
+        where nothing correlates.
     """
     if recording.free:
         return ()
-    answers = _answers(recording, model, range(model.modes) if modes is None else modes)
+    wanted = list(range(model.modes) if modes is None else modes)
+    answers = _answers(recording, model, wanted)
     negative = [a.channel for a in answers if a.gain < 0]
     out = [_inverted(a, len(negative) == len(answers), len(answers), recording) for a in answers if a.gain < 0]
-    return (*out, *(_scaled(a) for a in answers if scale and abs(np.log(abs(a.gain))) > np.log(FACTOR)))
+    out += [_scaled(a) for a in answers if scale and abs(np.log(abs(a.gain))) > np.log(FACTOR)]
+    return (*out, *_exchanged(recording, model, wanted, {a.channel for a in answers}))
+
+
+def _exchanged(recording: Recording, model: ModalModel, modes: Sequence[int], known: set[str]) -> Iterator[PolarityFinding]:
+    """A channel that makes no sense as an answer to the force, while the force does as an answer to the channel."""
+    if len(recording.inputs) != 1:
+        return
+    for c, channel in enumerate(recording.channels):
+        if channel.name in known:
+            continue
+        turned = replace(recording, response=recording.force, channels=(channel,), force=recording.response[:, [c]])
+        for answer in _answers(turned, model, modes):
+            force = recording.inputs[0].name
+            text = f"{channel.name} and {force} look exchanged: what is called the force answers what is called the motion"
+            yield PolarityFinding(channel.name, "swapped", answer.likeness, text, force)
 
 
 @final
