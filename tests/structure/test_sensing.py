@@ -91,6 +91,25 @@ def test_weights_give_the_least_noise_a_linear_filter_can(model: ModalModel) -> 
     np.testing.assert_allclose(spectrum.mean(axis=0), data.noise, rtol=0.15)
 
 
+def test_noise_of_displacement_sensors_grows_with_frequency_on_the_way_to_acceleration(model: ModalModel) -> None:
+    names = tuple(n for n, _ in SENSORS)
+    recording, _ = periodic(model, [0, 1], names)
+    moved = replace(recording, channels=tuple(replace(c, quantity="displacement") for c in recording.channels))
+    density = np.array([1e-12, 2e-12, 3e-12, 1e-10])
+    floor = Floor(np.linspace(0, FS / 2, 4000), np.tile(density, (4000, 1)))
+    data = modal_data(moved, model, [0, 1], (), (40.0, 900.0), noise=floor)
+    noise = np.random.default_rng(6).standard_normal((N, 4)) * np.sqrt(density * FS / 2)
+    noisy = modal_data(replace(moved, response=moved.response + noise), model, [0, 1], (), (40.0, 900.0), noise=floor)
+    f = np.fft.rfftfreq(N, 1 / FS)
+    spectrum = np.abs(np.fft.rfft(noisy.a - data.a, axis=0)) ** 2 * 2 / (N * FS)
+    for low, high in ((45, 120), (120, 300), (300, 800)):
+        part = (f > low) & (f < high)
+        for k in (0, 1):
+            assert np.mean(spectrum[part, k] / data.noise_density(k, f[part])) == pytest.approx(1.0, rel=0.3)
+    inside = np.linspace(40.0, 900.0, 2000)
+    assert [data.noise_density(k, inside).mean() for k in (0, 1)] == pytest.approx(data.noise, rel=0.02)
+
+
 def test_too_few_or_blind_sensors_are_refused_naming_modes(model: ModalModel) -> None:
     recording, _ = periodic(model, [0, 1, 2], ("S1", "S3"))
     with pytest.raises(ValueError, match=r"2 sensors cannot tell 3 modes apart \(1 \("):

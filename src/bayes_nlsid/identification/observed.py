@@ -307,5 +307,6 @@ class Observed:
             omega, zeta = self.linear.omega[cell.equation], self.linear.zeta[cell.equation]
             w = 2 * np.pi * self.frequency[cell.entries]
             gain = np.maximum(np.abs(1 + 2 * zeta * omega / (1j * w) - omega**2 / w**2), least) ** 2
-            out[cell.entries] = entry.noise[entry.modes.index(cell.equation)] * 0.5 / entry.dt * gain
+            density = entry.noise_density(cell.equation, self.frequency[cell.entries])
+            out[cell.entries] = density * 0.5 / entry.dt * gain
         return out

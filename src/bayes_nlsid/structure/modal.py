@@ -134,6 +134,9 @@ class ModalData:
         (low, high) Hz in which all of it is to be trusted.
     noise : ndarray (len(modes),)
         One-sided power spectral density of the noise of ``a``, per mode, averaged over the band, (kg^1/2 m/s²)²/Hz.
+    colour : ndarray (3, len(modes)), optional
+        The same noise as the parts of ``noise`` that are white as displacement, as velocity and as acceleration, one-sided densities
+        (kg^1/2 m)²/Hz, (kg^1/2 m/s)²/Hz, (kg^1/2 m/s²)²/Hz; white as acceleration if omitted.
     condition : float
         Condition number of the modal filter.
     periodic : bool
@@ -160,11 +163,14 @@ class ModalData:
     noise: NDArray[np.float64]
     condition: float = 1.0
     periodic: bool = False
+    colour: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        if not self.colour.size:
+            object.__setattr__(self, "colour", np.stack([0 * self.noise, 0 * self.noise, self.noise]))
         n, m, r = len(self.u), len(self.modes), len(self.locations)
         for name, shape in (("u", (n, m)), ("v", (n, m)), ("a", (n, m)), ("force", (n, m)), ("q", (n, r)), ("qd", (n, r)),
-                            ("noise", (m,))):
+                            ("noise", (m,)), ("colour", (3, m))):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"modal data {self.name!r}: {name} has shape {getattr(self, name).shape}, expected {shape}")
         if not 0 < self.band[0] < self.band[1] <= 0.5 / self.dt * (1 + 1e-9):
@@ -174,3 +180,9 @@ class ModalData:
     def n(self) -> int:
         """Number of samples."""
         return len(self.u)
+
+    def noise_density(self, mode: int, frequency: ArrayLike) -> NDArray[np.float64]:
+        """One-sided density (...), (kg^1/2 m/s²)²/Hz, of the noise of the acceleration of a mode (by its index in the model), Hz."""
+        w2 = (2 * np.pi * np.asarray(frequency, dtype=float)) ** 2
+        displacement, velocity, acceleration = self.colour[:, self.modes.index(mode)]
+        return np.asarray(acceleration + w2 * (velocity + w2 * displacement), dtype=float)

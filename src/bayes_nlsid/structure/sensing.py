@@ -77,12 +77,12 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
         motion = kinematics(recording, limits, fs)
         members = whole if bands is None else _heard(motion, model.frequency[list(chosen)], bands, own[0])
         x = _motions(recording, model, motion, limits, fs, static_correction)
-        level = acceleration_noise(psd, motion)
+        level, colour = acceleration_noise(psd, motion), noise_colour(psd, motion)
         picked = [chosen[i] for i in members]
         inverse, condition = modal_filter(rows[:, picked], level, [f"{k + 1} ({model.frequency[k]:.4g} Hz)" for k in picked])
         for i in own:
             row = inverse[members.index(i)]
-            columns[i] = {"u": x[0] @ row, "v": x[1] @ row, "a": x[2] @ row, "noise": row**2 @ level,
+            columns[i] = {"u": x[0] @ row, "v": x[1] @ row, "a": x[2] @ row, "noise": row**2 @ level, "colour": colour @ row**2,
                           "force": motion.force @ model.rows([c.location for c in motion.inputs])[:, chosen[i]]}
         valid = slice(max(valid.start, motion.valid.start), min(valid.stop, motion.valid.stop))
         conditions.append(condition)
@@ -97,7 +97,7 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
         G = _residual(model, joints, recording)
         q, qd = q + static.displacement @ G.T, qd + static.velocity @ G.T
     return ModalData(recording.name, dt, chosen, u, v, a, force, tuple(joints), q, qd, valid, band, spread, max(conditions),
-                     recording.period is not None)
+                     recording.period is not None, np.stack([c["colour"] for c in columns], axis=-1))
 
 
 def _estimated_noise(recording: Recording) -> NoiseFloor:
@@ -141,13 +141,31 @@ def modal_filter(rows: NDArray[np.float64], noise: NDArray[np.float64], names: S
 
 def acceleration_noise(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.float64]:
     """One-sided power spectral density (s,) of each channel's noise as an acceleration, averaged over the band, (m/s²)²/Hz."""
+    inside, factor = _as_acceleration(noise, motion)
+    return np.asarray(np.mean(noise.psd[inside] * factor, axis=0), dtype=float)
+
+
+def noise_colour(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.float64]:
+    """The same (3, s), taken as white in what each channel measures: displacement, velocity or acceleration.
+
+    The noise of a displacement sensor grows as ω⁴ on the way to acceleration: over a wide band its average would be that of the upper
+    edge, and far too much below.
+    """
+    _, factor = _as_acceleration(noise, motion)
+    out = np.zeros((3, len(motion.channels)))
+    order = [ORDER[c.quantity] for c in motion.channels]
+    out[order, np.arange(len(order))] = acceleration_noise(noise, motion) / factor.mean(axis=0)
+    return out
+
+
+def _as_acceleration(noise: NoiseFloor, motion: Kinematics) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Frequencies of a noise floor within the band, and the factor (f, s) there from each channel's density to that of acceleration."""
     inside = (noise.frequency >= motion.band[0]) & (noise.frequency <= motion.band[1])
     if not inside.any():
         inside = np.zeros(len(noise.frequency), dtype=bool)
         inside[np.argmin(np.abs(noise.frequency - np.sqrt(motion.band[0] * motion.band[1])))] = True
     power = 2 * np.array([2 - ORDER[c.quantity] for c in motion.channels])
-    omega = 2 * np.pi * noise.frequency[inside]
-    return np.asarray(np.mean(noise.psd[inside] * omega[:, None] ** power, axis=0), dtype=float)
+    return inside, (2 * np.pi * noise.frequency[inside, None]) ** power
 
 
 def _heard(motion: Kinematics, frequency: NDArray[np.float64], bands: Bands, i: int) -> list[int]:
