@@ -135,8 +135,8 @@ class ModalData:
     noise : ndarray (len(modes),)
         One-sided power spectral density of the noise of ``a``, per mode, averaged over the band, (kg^1/2 m/s²)²/Hz.
     colour : ndarray (3, len(modes)), optional
-        The same noise as the parts of ``noise`` that are white as displacement, as velocity and as acceleration, one-sided densities
-        (kg^1/2 m)²/Hz, (kg^1/2 m/s)²/Hz, (kg^1/2 m/s²)²/Hz; white as acceleration if omitted.
+        Shape of that noise over frequency, relative to ``noise``: coefficients (s^4, s², 1) of ω⁴, ω² and 1, the parts that are white as
+        displacement, as velocity and as acceleration; white as acceleration if omitted.
     condition : float
         Condition number of the modal filter.
     periodic : bool
@@ -167,7 +167,7 @@ class ModalData:
 
     def __post_init__(self) -> None:
         if not self.colour.size:
-            object.__setattr__(self, "colour", np.stack([0 * self.noise, 0 * self.noise, self.noise]))
+            object.__setattr__(self, "colour", np.repeat([[0.0], [0.0], [1.0]], len(self.noise), axis=1))
         n, m, r = len(self.u), len(self.modes), len(self.locations)
         for name, shape in (("u", (n, m)), ("v", (n, m)), ("a", (n, m)), ("force", (n, m)), ("q", (n, r)), ("qd", (n, r)),
                             ("noise", (m,)), ("colour", (3, m))):
@@ -184,5 +184,6 @@ class ModalData:
     def noise_density(self, mode: int, frequency: ArrayLike) -> NDArray[np.float64]:
         """One-sided density (...), (kg^1/2 m/s²)²/Hz, of the noise of the acceleration of a mode (by its index in the model), Hz."""
         w2 = (2 * np.pi * np.asarray(frequency, dtype=float)) ** 2
-        displacement, velocity, acceleration = self.colour[:, self.modes.index(mode)]
-        return np.asarray(acceleration + w2 * (velocity + w2 * displacement), dtype=float)
+        i = self.modes.index(mode)
+        displacement, velocity, acceleration = self.colour[:, i]
+        return np.asarray(self.noise[i] * (acceleration + w2 * (velocity + w2 * displacement)), dtype=float)

@@ -20,6 +20,7 @@ LARGEST_CONDITION = 100.0
 """Condition number of the sensor rows beyond which modes cannot be told apart in practice."""
 LEAK = 1e-3
 """Gain of a mode's filter at another mode's frequency from which that mode counts as present in the band."""
+TINY = float(np.finfo(float).tiny)
 Bands = Sequence[tuple[float, float]]
 
 
@@ -82,7 +83,9 @@ def modal_data(recording: Recording, model: ModalModel, modes: Sequence[int], jo
         inverse, condition = modal_filter(rows[:, picked], level, [f"{k + 1} ({model.frequency[k]:.4g} Hz)" for k in picked])
         for i in own:
             row = inverse[members.index(i)]
-            columns[i] = {"u": x[0] @ row, "v": x[1] @ row, "a": x[2] @ row, "noise": row**2 @ level, "colour": colour @ row**2,
+            power = row**2 * level
+            columns[i] = {"u": x[0] @ row, "v": x[1] @ row, "a": x[2] @ row, "noise": row**2 @ level,
+                          "colour": colour @ power / max(float(power.sum()), TINY),
                           "force": motion.force @ model.rows([c.location for c in motion.inputs])[:, chosen[i]]}
         valid = slice(max(valid.start, motion.valid.start), min(valid.stop, motion.valid.stop))
         conditions.append(condition)
@@ -146,7 +149,7 @@ def acceleration_noise(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.floa
 
 
 def noise_colour(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.float64]:
-    """The same (3, s), taken as white in what each channel measures: displacement, velocity or acceleration.
+    """Shape (3, s) of that density: coefficients of ω⁴, ω² and 1, taken as white in what each channel measures, with mean one in the band.
 
     The noise of a displacement sensor grows as ω⁴ on the way to acceleration: over a wide band its average would be that of the upper
     edge, and far too much below.
@@ -154,7 +157,7 @@ def noise_colour(noise: NoiseFloor, motion: Kinematics) -> NDArray[np.float64]:
     _, factor = _as_acceleration(noise, motion)
     out = np.zeros((3, len(motion.channels)))
     order = [ORDER[c.quantity] for c in motion.channels]
-    out[order, np.arange(len(order))] = acceleration_noise(noise, motion) / factor.mean(axis=0)
+    out[order, np.arange(len(order))] = 1 / factor.mean(axis=0)
     return out
 
 
