@@ -43,6 +43,15 @@ def test_a_table_with_units_gives_a_study_that_is_ready(tmp_path: Path) -> None:
     assert '# unit = "g", as written in the file' in text and text.count("guess") >= 8
 
 
+def test_times_that_were_rounded_give_the_rate_all_the_same(tmp_path: Path) -> None:
+    from bayes_nlsid.recordings.readers import read_file
+    from bayes_nlsid.study.survey import survey_recording
+
+    t = np.arange(2000) / 1024
+    file = table(tmp_path / "decay.csv", "time [s],acc [g]", np.round(t, 6), np.sin(70 * t))
+    assert survey_recording(file, read_file(file)).rate == pytest.approx(1024, rel=1e-6)
+
+
 def test_a_model_and_two_recordings(tmp_path: Path) -> None:
     files = [nominal(tmp_path)]
     for i, name in enumerate(("run1", "run2", "noise")):

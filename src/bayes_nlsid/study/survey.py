@@ -153,7 +153,9 @@ def _clock(contents: Contents, samples: int) -> tuple[tuple[str, str] | None, fl
     for name, array in contents.arrays.items():
         if _TIME.fullmatch(name) and array.size == samples:
             unit = unit_factor(contents.units[name], "time") if _measures(contents, name, "time") else 1.0
-            step = unit * float(np.median(np.diff(np.asarray(array, dtype=float).ravel())))
+            time = unit * np.asarray(array, dtype=float).ravel()
+            usual, whole = float(np.median(np.diff(time))), float(time[-1] - time[0]) / (samples - 1)
+            step = whole if abs(whole - usual) < 0.01 * usual else usual  # printed times are rounded; a gap would spoil the whole
             return ("time", name), 1 / step if step > 0 else None
     return None, None
 
