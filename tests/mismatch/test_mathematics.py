@@ -6,17 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.forces.term import Term
-from bayes_nlsid.mismatch.calibrate import calibrate
+from bayes_nlsid.mismatch.calibrate import PSEUDO, assemble, calibrate, finish, floored
 from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, catalogue_rows
 from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.krylov import gmres
 from bayes_nlsid.mismatch.laws import Size
-from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, shape_columns, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import LawAlong, bed
 from bayes_nlsid.mismatch.poles import pair, vector_fit
@@ -43,9 +44,14 @@ def chain_family(n: int = 8, sensors: int = 4) -> Family:
     M_parts = np.array([np.diag(np.linspace(1.0, 1.3, n))])
     eye = np.eye(n)
     places = {"J3_slip": eye[3] - eye[2], "J5_slip": eye[5] - eye[4]}
-    return Family((*names, "M:rho"), np.array(K_parts), M_parts, rest, np.zeros((n, n)), eye[[1, 3, 5, 7]][:sensors], eye[2], -np.ones(n),
+    rows = eye[[1, 3, 5, 7]] if sensors == 4 else eye[np.arange(sensors) % n]
+    values, basis = eigh(sum(K_parts) + rest, M_parts[0])
+    single = {i: _direction(k) for i, k in enumerate(K_parts)}
+    return Family((*names, "M:rho"), np.array(K_parts), M_parts, rest, np.zeros((n, n)), rows, eye[2], -np.ones(n),
                   np.ones(sensors), places, {"P1": eye[1], "P4": eye[7]}, np.array([0.3, 0.3, 0.3, 0.01]), 6, 0.01,
-                  {i: _direction(k) for i, k in enumerate(K_parts)}, np.zeros((0, n)))
+                  single, np.zeros((0, n)), M_parts[0] @ basis[:, :7] * np.sqrt(values[:7]),
+                  np.array([places["J3_slip"], places["J5_slip"]]),
+                  np.array([3.0, 3.0]))
 
 
 def _direction(part: np.ndarray) -> np.ndarray:
@@ -122,12 +128,72 @@ def test_jacobian_against_differences() -> None:
     fam = chain_family()
     rng = np.random.default_rng(3)
     theta = 0.5 * rng.normal(size=fam.size) * fam.prior_sd
+    theta[fam.moving + fam.modes:][:len(fam.dashpots)] = 0    # they couple the modes to first order only
     s = 2j * np.pi * np.linspace(3, 150, 40)
     J = jacobian(fam, theta, fields(fam, solve(fam, theta), s), s)
     for i in range(fam.size):
         d = 1e-5 * (np.arange(fam.size) == i)
         difference = (fields(fam, solve(fam, theta + d), s).H - fields(fam, solve(fam, theta - d), s).H) / 2e-5
         assert np.linalg.norm(J[i] - difference) < 2e-3 * np.linalg.norm(difference), fam.names[i] if i < 4 else i
+
+
+def test_errors_of_form_are_stiffness_between_nominal_modes_and_dashpots_couple_the_modes() -> None:
+    fam = chain_family()
+    theta = np.zeros(fam.size)
+    theta[-len(fam.pairs[0]):] = 0.01 * np.random.default_rng(4).normal(size=len(fam.pairs[0]))
+    theta[fam.moving:fam.moving + fam.modes] = 0.02
+    s = 2j * np.pi * np.linspace(3, 150, 9)
+    form = np.zeros((7, 7))
+    form[fam.pairs] = theta[-len(fam.pairs[0]):]
+    K = fam.K_parts.sum(0) + fam.K_rest + fam.mixing @ (form + form.T) @ fam.mixing.T
+    M = fam.M_parts[0]
+    force = M @ (modes := solve(fam, theta)).basis @ (modes.driven * (fam.shaker @ modes.basis))
+    damping = np.diag(2 * modes.zeta * modes.omega)
+    for c in (0.0, 0.03, 0.003):
+        theta[fam.moving + fam.modes] = c
+        row = fam.dashpots[0] @ modes.basis
+        coupled = damping + 3.0 * c * (np.outer(row, row) - np.diag(row ** 2))
+        C = M @ modes.basis @ coupled @ modes.basis.T @ M
+        exact = np.array([sk ** 2 * fam.sensors @ np.linalg.solve(M * sk ** 2 + C * sk + K, force) for sk in s])
+        assert np.linalg.norm(fields(fam, solve(fam, theta), s).H - exact) < (1e-9 + 30 * c ** 2) * np.linalg.norm(exact)
+
+
+def test_cost_is_the_marginal_likelihood_of_random_shape_errors() -> None:
+    fam = chain_family(sensors=3)
+    spectra = steady(fam, np.zeros(fam.size), noise=1e-5)
+    evidence = gather(spectra, (1.0, 170.0))
+    s, theta = spectra.s[spectra.excited][::4], np.zeros(fam.size)
+    H, variance = evidence.H[::4], floored(evidence.H, evidence.variance)[::4]
+
+    def brute(spread: np.ndarray) -> float:
+        system = assemble(fam, theta, np.zeros(0), s, H, variance, spread=spread)
+        total = PSEUDO * ((fam.error_sd / spread) ** 2 + 2 * np.log(spread)).sum()
+        for B, r in zip(system.B, system.r, strict=True):
+            covariance = np.eye(len(r)) + B.T @ (spread[:, None] ** 2 * B)
+            total += r @ np.linalg.solve(covariance, r) + np.linalg.slogdet(covariance)[1]
+        return float(total)
+
+    spreads = [fam.error_sd, 2 * fam.error_sd, fam.error_sd * np.linspace(0.5, 3, len(fam.error_sd))]
+    costs = [assemble(fam, theta, np.zeros(0), s, H, variance, spread=x).chi2 for x in spreads]
+    for x, cost in zip(spreads[1:], costs[1:], strict=True):
+        assert cost - costs[0] == pytest.approx(brute(x) - brute(spreads[0]), rel=1e-6)
+
+
+def test_size_of_shape_errors_is_found_mode_by_mode() -> None:
+    fam = chain_family(sensors=30)
+    modes = solve(fam, np.zeros(fam.size))
+    s = 2j * np.pi * np.linspace(3, 1.2 * modes.omega[5] / (2 * np.pi), 400)
+    fld = fields(fam, modes, s)
+    true = np.full(len(fam.error_sd), 0.001)
+    true[2] = 0.03
+    rng = np.random.default_rng(5)
+    errors = true * rng.normal(size=(30, len(true)))
+    H = fld.H + np.einsum("mls,sm->ls", shape_columns(fam, fld, s), errors)
+    noise = 1e-5 * np.abs(H).max()
+    H = H + noise * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape)) / np.sqrt(2)
+    fit = finish(fam, np.zeros(fam.size), s, H, np.full(H.shape, noise ** 2))
+    assert fit.spread[2] == pytest.approx(0.03, rel=0.35)
+    assert (fit.spread[[0, 1, 3, 4]] < 0.004).all()
 
 
 def test_calibration_recovers_known_multipliers() -> None:

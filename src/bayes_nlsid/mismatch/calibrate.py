@@ -2,7 +2,9 @@
 
 Poles of the measurement (vector fitting, started at the nominal poles) are paired with nominal modes by MAC, which brings the
 physical parameters into the right basin; then the transfer function itself is fitted, first coarsely, at last against its noise. Errors
-of single mode shapes at single sensors are random effects and are integrated out sensor by sensor.
+of single mode shapes at single sensors are random effects and are integrated out sensor by sensor; how large they are, mode by mode, is
+estimated by the marginal likelihood (EM: Dempster, Laird and Rubin 1977), so that the form of a good model is trusted and that of a bad
+one is not, and differences of cost between hypotheses mean what they say.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from bayes_nlsid.mismatch.poles import modal_start
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-RELATIVE_FLOOR = 7e-4
+RELATIVE_FLOOR = 2e-4  # of any model of this kind
+PSEUDO = 3.0  # sensors that the usual size of shape errors counts for
 
 
 @final
@@ -92,6 +95,9 @@ class LinearFit:
     normal : ndarray (P + X, P + X)
         Curvature of cost/2, priors included.
     shape_errors : ndarray (S, m)
+        Those of modes in the band, and of groups beyond it.
+    spread : ndarray (m,)
+        Their standard deviations, fitted.
     s, measured, variance : lines, measured accelerance (L, S), its variance
     system : System
         The normal equations at the optimum.
@@ -111,6 +117,7 @@ class LinearFit:
     dof: int
     normal: Array
     shape_errors: Array
+    spread: Array
     s: Complex
     measured: Complex
     variance: Array
@@ -179,8 +186,9 @@ def predict(fam: Family, theta: Array, s: Complex, extension: Extension | None, 
 
 
 def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex, variance: Array,
-             extension: Extension | None = None, log: bool = False, derivatives: bool = True) -> System:
-    """Normal equations of one Gauss–Newton step in (theta, x), data part only."""
+             extension: Extension | None = None, log: bool = False, derivatives: bool = True, spread: Array | None = None) -> System:
+    """Normal equations of one Gauss–Newton step in (theta, x), data part only; ``spread`` (modes + BEYOND,): sd of the errors of shapes."""
+    spread = fam.error_sd if spread is None else spread
     fld, chain = predict(fam, theta, s, extension, x)
     H, B = fld.H, shape_columns(fam, fld, s)
     J = jacobian(fam, theta, fld, s) if derivatives else np.zeros((0, *H.shape), dtype=complex)
@@ -200,10 +208,11 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
         residual, J, B = np.log(measured / H), J / H, B / H
     root = np.sqrt(variance.T / 2)
     Jr, Br, r = np.moveaxis(stack(J, root), 1, 0), np.moveaxis(stack(B, root), 1, 0), stack(residual, root)
-    C = Br @ np.swapaxes(Br, 1, 2) + np.eye(Br.shape[1]) / fam.shape_sd ** 2
+    gram = Br @ np.swapaxes(Br, 1, 2)
+    C = gram + np.eye(Br.shape[1]) / spread ** 2
     Brr = np.einsum("smk,sk->sm", Br, r)
     effect = np.linalg.solve(C, Brr[..., None])[..., 0]
-    chi2 = float((r ** 2).sum() - (Brr * effect).sum())
+    chi2 = float((r ** 2).sum() - (Brr * effect).sum()) + _price(gram, C, spread, fam.error_sd)
     if not derivatives:
         return System(np.zeros((0, 0)), np.zeros(0), chi2, root, Br, Jr, C, r)
     BJ = Br @ np.swapaxes(Jr, 1, 2)
@@ -214,8 +223,28 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
     return System(normal, gradient, chi2, root, Br, Jr, C, r)
 
 
+def _price(gram: Array, C: Array, spread: Array, usual: Array) -> float:
+    """What errors of shapes larger or smaller than usual cost: ratio of determinants and an inverse-gamma prior on each variance."""
+    if spread is usual or np.array_equal(spread, usual):
+        return 0.0
+    ratio = (usual / spread) ** 2
+    before = np.linalg.slogdet(gram + np.eye(len(usual)) / usual ** 2)[1].sum() + 2 * len(gram) * np.log(usual).sum()
+    after = np.linalg.slogdet(C)[1].sum() + 2 * len(gram) * np.log(spread).sum()
+    return float(after - before + PSEUDO * (ratio - np.log(ratio) - 1).sum())
+
+
+def spread_of(system: System, spread: Array, usual: Array, rounds: int = 8) -> Array:
+    """Likeliest sd of shape errors mode by mode (EM), the rest of the model held."""
+    gram, right = system.B @ np.swapaxes(system.B, 1, 2), np.einsum("smk,sk->sm", system.B, system.r)
+    for _ in range(rounds):
+        inverse = np.linalg.inv(gram + np.eye(len(usual)) / spread ** 2)
+        squares = (inverse @ right[..., None])[..., 0] ** 2 + np.einsum("smm->sm", inverse)
+        spread = np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram)))
+    return np.asarray(spread)
+
+
 def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, steps: int, *, prior_sd: Array | None = None,
-            extension: Extension | None = None, x: Array | None = None, log: bool = False, tol: float = 1e-3
+            extension: Extension | None = None, x: Array | None = None, log: bool = False, tol: float = 1e-3, spread: Array | None = None
             ) -> tuple[Array, Array, float]:
     """Levenberg–Marquardt on cost = chi² + priors; returns the best theta, x and cost."""
     count = fam.size
@@ -226,7 +255,7 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
         prior = np.concatenate([prior, 1 / extension.prior_sd ** 2])
         centre = np.concatenate([centre, extension.centre])
     y = np.concatenate([theta, x])
-    system = assemble(fam, theta, x, s, measured, variance, extension, log)
+    system = assemble(fam, theta, x, s, measured, variance, extension, log, spread=spread)
     cost = system.chi2 + float(prior @ (y - centre) ** 2)
     damping = 1e-3
     for _ in range(steps):
@@ -235,7 +264,7 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
         for _ in range(6):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             trial = y + np.clip(step, -1.5, 1.5)
-            new = assemble(fam, trial[:count], trial[count:], s, measured, variance, extension, log, derivatives=False).chi2
+            new = assemble(fam, trial[:count], trial[count:], s, measured, variance, extension, log, derivatives=False, spread=spread).chi2
             new += float(prior @ (trial - centre) ** 2)
             if np.isfinite(new) and new < cost:
                 accepted = True
@@ -247,15 +276,25 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
         cost = new
         if gain < tol * max(1.0, 1e-3 * cost):
             break
-        system = assemble(fam, y[:count], y[count:], s, measured, variance, extension, log)
+        system = assemble(fam, y[:count], y[count:], s, measured, variance, extension, log, spread=spread)
     return y[:count], y[count:], cost
 
 
 def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, extension: Extension | None = None,
-           x: Array | None = None, prior_sd: Array | None = None, status: str = "ok") -> LinearFit:
-    """Curvature, random effects and best prediction at ``theta``, ``x``."""
+           x: Array | None = None, prior_sd: Array | None = None, status: str = "ok", spread: Array | None = None,
+           rounds: int = 6) -> LinearFit:
+    """Curvature, random effects and best prediction at ``theta``, ``x``; in ``rounds`` the size of shape errors is fitted too."""
     x = np.zeros(0) if x is None else x
-    system = assemble(fam, theta, x, s, measured, variance, extension)
+    spread = fam.error_sd if spread is None else spread
+    system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
+    before = np.inf
+    for _ in range(rounds):
+        spread = spread_of(system, spread, fam.error_sd)
+        theta, x, cost = descend(fam, theta, s, measured, variance, 2, prior_sd=prior_sd, extension=extension, x=x, tol=0.1, spread=spread)
+        system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
+        if before - cost < 1.0:
+            break
+        before = cost
     fld, chain = predict(fam, theta, s, extension, x)
     prior = 1 / (fam.prior_sd if prior_sd is None else prior_sd) ** 2
     cost = system.chi2 + float(prior @ theta ** 2) + (extension.penalty(x) if extension is not None else 0.0)
@@ -266,7 +305,7 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
     rest = system.gradient - np.concatenate([prior * theta, (x - extension.centre) / extension.prior_sd ** 2] if extension is not None
                                             else [prior * theta])
     full = system.normal + np.diag(np.concatenate([prior, 1 / extension.prior_sd ** 2]) if extension is not None else prior)
-    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, s, measured, variance,
+    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, spread, s, measured, variance,
                      system, rest, misfit, status)
 
 
@@ -276,7 +315,7 @@ def calibrate(fam: Family, s: Complex, measured: Complex, variance: Array, *, re
     Parameters
     ----------
     s : (L,) Laplace variable; ``measured`` (L, S) m/s²/N; ``variance`` (L, S) of it (noise and distortion; the floor of the model,
-        0.07 %, is added here).
+        ``RELATIVE_FLOOR``, is added here).
     restarts : starts with other stiffnesses tried while the cost per value stays above ``enough``.
     """
     variance = floored(measured, variance)
@@ -284,8 +323,8 @@ def calibrate(fam: Family, s: Complex, measured: Complex, variance: Array, *, re
     starts = [np.zeros(fam.size) if guess is None else guess, *_group_starts(fam)]
     best, cost = _anneal(fam, starts[0], s, measured, variance)
     if restarts and cost > enough * 2 * measured.size:
-        others = sorted((_coarse(fam, first, s, measured, variance) for first in starts[1:1 + restarts]), key=lambda c: c[1])
-        for theta, _ in others[:2]:
+        others = sorted((coarse(fam, first, s, measured, variance) for first in starts[1:1 + restarts]), key=lambda c: c[2])
+        for theta, _, _ in others[:2]:
             theta, _, value = descend(fam, theta, s, measured, variance, 25, tol=0.05)
             if value < cost:
                 best, cost = theta, value
@@ -314,22 +353,30 @@ def floored(measured: Complex, variance: Array) -> Array:
     return np.asarray(variance + (RELATIVE_FLOOR * np.abs(measured)) ** 2)
 
 
-def _coarse(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
-    """Log residual with 30 % tolerance, then relative tolerances of 10 and 2 %; cost at the last of them."""
+def coarse(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, extension: Extension | None = None,
+           x: Array | None = None) -> tuple[Array, Array, float]:
+    """Log residual with 30 % tolerance, then relative tolerances of 10 and 2 %; theta, x and the cost at the last of them."""
     relative = variance / np.maximum(np.abs(measured) ** 2, 1e-300)
     thin = slice(None, None, 3)
     wide = fam.prior_sd.copy()
     wide[len(fam.names):len(fam.names) + fam.modes] = 0.01
-    theta, _, _ = descend(fam, theta, s[thin], measured[thin], relative[thin] + 0.3 ** 2, 12, prior_sd=wide, log=True, tol=0.3)
+    theta, x, _ = descend(fam, theta, s[thin], measured[thin], relative[thin] + 0.3 ** 2, 12, prior_sd=wide, extension=extension, x=x,
+                          log=True, tol=0.3)
     cost = np.inf
     for tolerance in (0.1, 0.02):
         inflated = variance + (tolerance * np.abs(measured)) ** 2
-        theta, _, cost = descend(fam, theta, s[thin], measured[thin], inflated[thin], 8, tol=0.3)
-    return theta, cost
+        theta, x, cost = descend(fam, theta, s[thin], measured[thin], inflated[thin], 8, extension=extension, x=x, tol=0.3)
+    return theta, x, cost
+
+
+def strained(fam: Family, theta: Array, sd: Array) -> bool:
+    """Whether physical parameters lie further from nominal than their tolerances let expect."""
+    count = len(fam.names)
+    return float(((theta[:count] / sd[:count]) ** 2).sum()) > 2 * count + 10
 
 
 def _anneal(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array) -> tuple[Array, float]:
     """Coarse to fine, at last against noise."""
-    theta, _ = _coarse(fam, theta, s, measured, variance)
+    theta, _, _ = coarse(fam, theta, s, measured, variance)
     theta, _, cost = descend(fam, theta, s, measured, variance, 25, tol=0.05)
     return theta, cost

@@ -72,6 +72,12 @@ class Evidence:
         records, lines, channels = self.residual.shape
         return 2 * channels * (int(self.excited.sum()) * (records - 1) + int((~self.excited).sum()) * records)
 
+    def doubted(self, residual: Complex) -> Array:
+        """(Le, S): variance of the transfer function where it may be bent as much as the unexplained ``residual`` (R, L, S) is large."""
+        size = np.einsum("r,rls->ls", self.trust, np.abs(residual[:, self.excited]) ** 2) / max(len(residual) - 1, 1)
+        power = np.einsum("r,rl->l", self.trust, np.abs(self.spectra.force[:, self.excited]) ** 2)
+        return np.asarray(np.maximum(self.variance, local_mean(size, 3) / power[:, None]))
+
     def project(self, force: Complex) -> Complex:
         """Remove from (..., R, L) what a free linear path from the shaker force explains."""
         return np.asarray(force - self.spectra.force * self.shadow(force)[..., None, :])

@@ -72,7 +72,7 @@ def sensor_paths(fam: Family, modes: Modes, s: Complex, places: list[str], error
     out = receptances(modes, s, fam.sensors, rows)
     if errors is not None:
         m = fam.modes
-        S, b = (fam.sensors @ modes.basis)[:, :m] * errors, (rows @ modes.basis)[:, :m]
+        S, b = (fam.sensors @ modes.basis)[:, :m] * errors[:, :m], (rows @ modes.basis)[:, :m]
         inverse = 1 / modes.denominators(s)[:, :m]
         out = out + np.einsum("lm,sm,jm->lsj", inverse, S, b, optimize=True)
     return np.asarray(s[:, None, None] ** 2 * out)

@@ -1,25 +1,30 @@
-"""One Gauss–Newton iteration in everything at once: law parameters and linear parameters, for the hypothesis that leads.
+"""Gauss–Newton in everything at once: law parameters and linear parameters together, by forward simulation.
 
-Alternating between law and calibration (``polish``) stalls where one can take over what the other does, as a modal damping ratio and a
+Alternating between law and calibration stalls where one can take over what the other does, as a modal damping ratio and a
 damper at a joint. Here both parts of the sum of squares, projected residual and transfer function, are linearised in both kinds of
 parameters: the linear ones move the paths to and from the place, the law moves the transfer function that is left.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrate import System, assemble, finish, floored, stack
+from bayes_nlsid.mismatch.calibrate import LinearFit, System, assemble, finish, floored, stack
 from bayes_nlsid.mismatch.effects import Effect, extension, packed, unpack
+from bayes_nlsid.mismatch.evidence import Evidence
+from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.linear import solve
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import (
     Bench,
     Hypothesis,
+    begin,
+    estimate_linear,
     force_strengths,
     hypothesis,
     paths_to_sensors,
@@ -30,6 +35,7 @@ from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+STRONG = 1.5   # chi² of the projected residual over its expectation
 
 
 @final
@@ -48,7 +54,7 @@ class Point:
 class Joint:
     """The sum of squares of one hypothesis as a function of law (y) and linear (theta, x) parameters."""
 
-    def __init__(self, bench: Bench, h: Hypothesis) -> None:
+    def __init__(self, bench: Bench, h: Hypothesis, doubt: bool = False) -> None:
         self.bench, self.h = bench, h
         self.forces = h.forces
         self.places = [e.place for e in self.forces]
@@ -60,7 +66,7 @@ class Joint:
         self.edges = np.concatenate([[0], np.cumsum([len(p) for p in self.y0])]).astype(int)
         evidence = bench.evidence
         self.s = evidence.spectra.s[evidence.excited]
-        self.variance = floored(evidence.H, evidence.variance)
+        self.variance = floored(evidence.H, evidence.doubted(h.residual) if doubt else evidence.variance)
         self.sd = widened(bench.family, {e.place for e in h.effects if e.is_force or e.cls == "linear_stiffness"})
 
     def effects(self, y: Array) -> tuple[Effect, ...]:
@@ -85,94 +91,144 @@ class Joint:
         cleaned = evidence.H + np.einsum("lsj,lj->ls", h[evidence.excited], shadow)
         return Point(residual, cleaned, there.motions, there.status, force_strengths(bench, h, there.lines))
 
+    def fit(self, point: Point, theta: Array, x: Array) -> LinearFit:
+        """The linear model at a point."""
+        return finish(self.bench.family, theta, self.s, point.cleaned, self.variance, self.ext, x, self.sd, spread=self.h.fit.spread,
+                      rounds=0)
+
     def cost(self, point: Point, theta: Array, x: Array) -> float:
         """−2 log posterior at a point."""
-        system = assemble(self.bench.family, theta, x, self.s, point.cleaned, self.variance, self.ext, derivatives=False)
+        system = assemble(self.bench.family, theta, x, self.s, point.cleaned, self.variance, self.ext, derivatives=False,
+                          spread=self.h.fit.spread)
         prior = float(((theta / self.sd) ** 2).sum()) + (self.ext.penalty(x) if self.ext is not None else 0.0)
         return float((np.abs(point.residual) ** 2).sum()) + system.chi2 + prior
 
 
-def refine(bench: Bench, h: Hypothesis, steps: int = 5) -> Hypothesis:
-    """Joint Gauss–Newton iterations from a polished hypothesis; returns it unchanged if nothing is gained."""
+def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]) -> Hypothesis:
+    """Joint estimation of up to two effects with the linear model.
+
+    Parameters
+    ----------
+    start : linear fit to begin from.
+    candidates : effects with starting values from the first search.
+    """
+    if not any(c.effect.is_force for c in candidates):
+        return estimate_linear(bench, start, candidates)
+    return pursue(bench, begin(bench, start, candidates))
+
+
+def strong(evidence: Evidence) -> bool:
+    """Whether what is not linear stands so far above the noise that the transfer function may be bent by it."""
+    return evidence.chi2 > STRONG * evidence.values
+
+
+def pursue(bench: Bench, h: Hypothesis) -> Hypothesis:
+    """Joint estimation from where a law begins: where it is strong, first with a transfer function that is doubted as far as the law leaves
+    something unexplained, for a wrong law bends the linear model."""
+    if strong(bench.evidence):
+        there = refine(bench, refine(bench, h, steps=5, quick=True, doubt=True), steps=6, quick=True)
+        return there if there.cost < h.cost else h
+    return refine(bench, h, steps=4, quick=True)
+
+
+def refine(bench: Bench, h: Hypothesis, steps: int = 5, quick: bool = False, doubt: bool = False) -> Hypothesis:
+    """Joint Gauss–Newton iterations; returns the hypothesis unchanged if nothing is gained.
+
+    Parameters
+    ----------
+    quick : of what linear parameters do to the motion at the place, only the stiffness there counts in the derivatives, which saves most
+        simulations, and marches take their longest steps.
+    doubt : the transfer function counts as far as it is not bent by what ``h`` leaves unexplained; what comes back may cost more.
+    """
     if not h.forces:
         return h
-    joint = Joint(bench, h)
+    joint = Joint(bench, h, doubt)
     theta, x, errors = h.fit.theta, h.fit.x, h.fit.shape_errors
     y = np.concatenate(joint.y0)
-    now = joint.at(y, theta, x, errors, None)
+    now = joint.at(y, theta, x, errors, None, coarse=quick)
     cost = joint.cost(now, theta, x)
     damping, curvature = 1e-3, h.curvature
+    names = bench.family.names[:len(bench.family.K_parts)]
+    moving = [i for i, name in enumerate(names) if name in joint.places] if quick else list(range(bench.family.moving))
     kept: tuple[Complex, Complex] | None = None
-    fresh = 0
-    while fresh < steps:
-        # columns of linear parameters are dear and change little: they serve three steps, or until they fail
+    for _ in range(steps):
+        # columns of linear parameters are dear and change little: they serve while they lead on
         stale = kept is not None
-        normal, gradient, curvature, kept = _linearise(joint, now, y, theta, x, errors, kept)
-        fresh += 1
-        accepted = False
-        for _ in range(4):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            step[:len(y)] = np.clip(step[:len(y)], -1.0, 1.0)
-            step[len(y):] = np.clip(step[len(y):], -1.0, 1.0)
-            trial = (y + step[:len(y)], theta + step[len(y):len(y) + len(theta)], x + step[len(y) + len(theta):])
-            there = joint.at(*trial, errors, now.motions)
-            new = joint.cost(there, trial[1], trial[2])
-            if np.isfinite(new) and new < cost:
-                accepted = True
-                break
-            damping = max(8 * damping, 1e-3)
-        if not accepted and not stale:
+        normal, gradient, curvature, kept = _linearise(joint, now, y, theta, x, errors, moving, kept)
+        trial, there, new, damping = _step(joint, now, (y, theta, x), errors, normal, gradient, damping, cost, quick)
+        if there is None and not stale:
             break
-        if not accepted:
+        if there is None:
             kept, damping = None, 1e-3
             continue
         gain, (y, theta, x), now, cost, damping = cost - new, trial, there, new, max(damping / 8, 1e-7)
-        kept = None if fresh % 3 == 0 else kept
-        errors = finish(bench.family, theta, joint.s, now.cleaned, joint.variance, joint.ext, x, joint.sd).shape_errors
-        if gain < 1e-4 * cost:
-            if not stale:
-                break
-            kept = None
+        kept = None if quick else kept
+        errors = joint.fit(now, theta, x).shape_errors
+        if gain < 1e-4 * cost and not stale:
+            break
+        kept = None if gain < 0.02 * cost else kept
     now = joint.at(y, theta, x, errors, now.motions)
-    fit = finish(bench.family, theta, joint.s, now.cleaned, joint.variance, joint.ext, x, joint.sd)
+    if doubt:
+        joint.variance = floored(bench.evidence.H, bench.evidence.variance)
+    fit = joint.fit(now, theta, x)
     forces = list(joint.effects(y))
     effects = tuple(forces.pop(0) if e.is_force else e for e in h.effects)
     found = hypothesis(bench, effects, h.kinds, fit, float((np.abs(now.residual) ** 2).sum()), curvature, now.residual / joint.root,
                        now.status, now.strengths)
-    return found if found.cost < h.cost else h
+    return found if doubt or found.cost < h.cost else h
 
 
-def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, errors: Array, kept: tuple[Complex, Complex] | None
-               ) -> tuple[Array, Array, Array, tuple[Complex, Complex]]:
+def _step(joint: Joint, now: Point, at: tuple[Array, Array, Array], errors: Array, normal: Array, gradient: Array, damping: float,
+          cost: float, coarse: bool) -> tuple[tuple[Array, Array, Array], Point | None, float, float]:
+    """The first damped step that lowers the cost: where it leads, the point there (None if there was no such step), its cost, damping."""
+    y, theta, x = at
+    edges = np.cumsum([len(y), len(theta)])
+    for _ in range(6):
+        step = np.clip(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), -1.0, 1.0)
+        dy, dt, dx = np.split(step, edges)
+        trial = (y + dy, theta + dt, x + dx)
+        there = joint.at(*trial, errors, now.motions, coarse=coarse)
+        new = joint.cost(there, trial[1], trial[2])
+        if np.isfinite(new) and new < cost:
+            return trial, there, new, damping
+        damping = max(8 * damping, 1e-3)
+    return at, None, cost, damping
+
+
+def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, errors: Array, moving: Sequence[int],
+               kept: tuple[Complex, Complex] | None) -> tuple[Array, Array, Array, tuple[Complex, Complex]]:
     """Normal matrix and gradient in (y, theta, x), the curvature in y with all linear parameters profiled out, and the columns.
 
-    ``kept``: columns of an earlier step, whose part for ``theta`` is used again.
+    Parameters
+    ----------
+    moving : those of ``theta`` whose effect on the motion of the place counts; the others only change the transfer function.
+    kept : columns of ``moving`` from an earlier step, which are used again.
     """
     fam = joint.bench.family
-    system = assemble(fam, theta, x, joint.s, now.cleaned, joint.variance, joint.ext)
-    count = len(y) + len(theta)
-    columns = np.zeros((count + len(x), now.residual.size), dtype=complex)
-    change = np.zeros((count + len(x), *now.cleaned.shape), dtype=complex)
+    system = assemble(fam, theta, x, joint.s, now.cleaned, joint.variance, joint.ext, spread=joint.h.fit.spread)
+    laws, count = len(y), len(y) + len(theta) + len(x)
+    active = np.concatenate([np.arange(laws), laws + np.asarray(moving, dtype=int)])
+    columns = np.zeros((len(active), now.residual.size), dtype=complex)
+    change = np.zeros((count, *now.cleaned.shape), dtype=complex)
     still = joint.at(y, theta, x, errors, now.motions, most=12, coarse=True)
     if kept is not None:
-        columns[len(y):count], change[len(y):count] = kept[0][len(y):count], kept[1][len(y):count]
-    for i in range(count if kept is None else len(y)):
-        law, step = i < len(y), 1e-3 if i < len(y) else 1e-3 * float(np.clip(joint.sd[i - len(y)], 1e-3, 0.3))
-        yy = y + step * (np.arange(len(y)) == i)
-        tt = theta if law else theta + step * (np.arange(len(theta)) == i - len(y))
+        columns[laws:], change[active[laws:]] = kept
+    for k, i in enumerate(active if kept is None else active[:laws]):
+        law, step = i < laws, 1e-3 if i < laws else 1e-3 * float(np.clip(joint.sd[i - laws], 1e-3, 0.3))
+        yy = y + step * (np.arange(laws) == i)
+        tt = theta if law else theta + step * (np.arange(len(theta)) == i - laws)
         moved = joint.at(yy, tt, x, errors, now.motions, most=12, coarse=True)
-        columns[i] = ((still.residual - moved.residual) / step).ravel()
+        columns[k] = ((still.residual - moved.residual) / step).ravel()
         change[i] = (moved.cleaned - still.cleaned) / step
-    linear = _columns(system, change, len(y))
-    normal = (columns.conj() @ columns.T).real + linear[0]
-    gradient = (columns.conj() @ now.residual.ravel()).real + linear[1]
-    prior = np.concatenate([np.full(len(y), 1e-2), 1 / joint.sd ** 2, np.zeros(0) if joint.ext is None else 1 / joint.ext.prior_sd ** 2])
+    normal, gradient = _columns(system, change, laws)
+    normal[np.ix_(active, active)] += (columns.conj() @ columns.T).real
+    gradient[active] += (columns.conj() @ now.residual.ravel()).real
+    prior = np.concatenate([np.full(laws, 1e-2), 1 / joint.sd ** 2, np.zeros(0) if joint.ext is None else 1 / joint.ext.prior_sd ** 2])
     centre = np.concatenate([y, np.zeros(len(theta)), np.zeros(0) if joint.ext is None else joint.ext.centre])
     normal += np.diag(prior)
     gradient -= prior * (np.concatenate([y, theta, x]) - centre)
-    k = len(y)
-    curvature = normal[:k, :k] - normal[:k, k:] @ np.linalg.solve(normal[k:, k:], normal[k:, :k])
-    return normal, gradient, curvature, (columns, change)
+    curvature = normal[:laws, :laws] - normal[:laws, laws:] @ np.linalg.solve(normal[laws:, laws:], normal[laws:, :laws])
+    return normal, gradient, curvature, (columns[laws:], change[active[laws:]])
 
 
 def _columns(system: System, change: Complex, laws: int) -> tuple[Array, Array]:
@@ -192,4 +248,4 @@ def _columns(system: System, change: Complex, laws: int) -> tuple[Array, Array]:
     return normal, gradient
 
 
-__all__ = ["Joint", "Point", "refine"]
+__all__ = ["Joint", "Point", "estimate", "pursue", "refine", "strong"]

@@ -1,4 +1,9 @@
-"""The nominal model as a family: stiffness and mass parts scaled, modes detuned, local dynamic stiffness added.
+"""The nominal model as a family: stiffness and mass parts scaled, modes detuned, mixed and coupled, local dynamic stiffness added.
+
+What a nominal model has wrong beside its parameters is its form: beam theory, mesh, damping. It shows as modes that are detuned, that are
+mixed with one another (stiffness between nominal modes, an exact part of the eigenvalue problem), that are coupled by dashpots at the
+joints, and whose shapes are in error at the shaker and at the sensors. All that has a size stated beforehand; that of the shapes at the
+sensors is corrected by the data.
 
 All receptances come from a fixed Ritz basis (lowest modes and static shapes of every named direction), so that one evaluation costs
 an eigenvalue problem of some sixty unknowns however large the nominal model is.
@@ -6,7 +11,7 @@ an eigenvalue problem of some sixty unknowns however large the nominal model is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -16,6 +21,8 @@ from bayes_nlsid.mismatch.case import Case
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+BEYOND = 3  # groups of modes beyond the band whose contribution may be in error: the next, the one after it, all others
+ABOVE = 1.5  # times the end of the band, up to where a mode has its own frequency and damping
 
 
 @final
@@ -40,14 +47,22 @@ class Family:
     scale_sd : ndarray (P + Q,)
         Prior standard deviations of the log multipliers.
     modes : int
-        Modes that get their own frequency and damping deviation (those up to a quarter above the band).
+        Modes that get their own frequency and damping deviation (those up to ``ABOVE`` times the end of the band).
     damping : float
     single : dict of int to ndarray (n,)
         Stiffness parts of rank one, as b with part = b bᵀ.
+    mixing : ndarray (n, modes + 1)
+        M φ ω of the nominal modes: stiffness κ ω_i ω_j between two of them is what errors of the form of the model mix them by.
+    dashpots : ndarray (D, n)
+        Directions along which damping of a joint may couple the modes.
+    dashpot : ndarray (D,)
+        N s/m that would double the nominal damping of the mode most affected.
     silent : ndarray (S', n)
         Channels that were left out of the analysis; their motion can be predicted all the same.
-    mode_sd, damping_sd, shape_sd : float
-        Log-frequency deviation of one mode; log damping; relative error of one mode at one sensor.
+    mode_sd, damping_sd, drive_sd, dashpot_sd : float
+        Log-frequency deviation of one mode; log damping; relative error of one mode at the shaker; strength of a dashpot.
+    shape_sd, beyond_sd : float
+        Relative error of one mode at one sensor, before the data have been seen; the same of modes beyond the band.
     """
 
     names: tuple[str, ...]
@@ -66,19 +81,43 @@ class Family:
     damping: float
     single: dict[int, Array]
     silent: Array
+    mixing: Array
+    dashpots: Array
+    dashpot: Array
     mode_sd: float = 0.003
     damping_sd: float = 0.25
-    shape_sd: float = 0.004
+    drive_sd: float = 0.003
+    dashpot_sd: float = 0.2
+    mixing_sd: float = 0.003
+    shape_sd: float = 0.003
+    beyond_sd: float = 0.01
 
     @property
     def size(self) -> int:
-        """Number of linear parameters: scales, log-frequency deviations, log-damping deviations."""
+        """Number of linear parameters: scales, log-frequency deviations, log-damping deviations, errors at the shaker, dashpots."""
+        return self.moving + self.modes + len(self.dashpots) + len(self.pairs[0])
+
+    @property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs of modes that errors of the form of the stiffness may mix: those with a deviation of their own and the next one."""
+        return np.triu_indices(self.modes + 1, 1)
+
+    @property
+    def moving(self) -> int:
+        """Number of those that the motion of the structure depends on; the rest only correct its transfer function."""
         return len(self.names) + 2 * self.modes
 
     @property
     def prior_sd(self) -> Array:
         """(size,)."""
-        return np.concatenate([self.scale_sd, np.full(self.modes, self.mode_sd), np.full(self.modes, self.damping_sd)])
+        return np.concatenate([self.scale_sd, np.full(self.modes, self.mode_sd), np.full(self.modes, self.damping_sd),
+                               np.full(self.modes, self.drive_sd), np.full(len(self.dashpots), self.dashpot_sd),
+                               np.full(len(self.pairs[0]), self.mixing_sd)])
+
+    @property
+    def error_sd(self) -> Array:
+        """(modes + BEYOND,): of the errors of each mode at one sensor."""
+        return np.concatenate([np.full(self.modes, self.shape_sd), np.full(BEYOND, self.beyond_sd)])
 
 
 @final
@@ -94,12 +133,18 @@ class Modes:
         Mass-normalised modes in Ritz coordinates.
     undisturbed : ndarray (m,)
         rad/s without the deviations of single modes.
+    driven : ndarray (m,)
+        Factor on the modal force of the shaker.
+    viscous : ndarray (D,)
+        Dashpots that couple the modes, N s/m.
     """
 
     omega: Array
     zeta: Array
     basis: Array
     undisturbed: Array
+    driven: Array
+    viscous: Array
 
     def denominators(self, s: Complex) -> Complex:
         """(L, m): s² + 2 ζ ω s + ω²."""
@@ -126,15 +171,33 @@ def family(case: Case) -> Family:
     names = tuple(reduce["K"]) + tuple(f"M:{n}" for n in reduce["M"])
     K_parts, M_parts = np.array(list(reduce["K"].values())), np.array(list(reduce["M"].values()))
     frequencies = np.sqrt(la.eigh(case.K, case.M, eigvals_only=True, subset_by_index=[0, keep - 1])) / (2 * np.pi)
-    modes = int(np.searchsorted(frequencies, 1.25 * case.band[1]))
+    own = max(1, min(int(np.searchsorted(frequencies, ABOVE * case.band[1])), T.shape[1]))
     sd = np.array([_scale_sd(case, n) for n in case.K_parts] + [case.tolerances["rho_rel_sd"]] * len(M_parts))
     rows = case.sensor_rows[case.usable]
+    single = _single(K_parts)
+    links = np.array([case.places[names[i]] @ T for i in single if names[i] in case.places]).reshape(-1, T.shape[1])
     return Family(names, K_parts, M_parts, T.T @ case.K @ T - K_parts.sum(0), T.T @ case.M @ T - M_parts.sum(0), rows @ T,
                   case.shaker @ T, -(case.M @ case.base) @ T, rows @ case.base,
                   {k: v @ T for k, v in case.places.items()}, {k: v @ T for k, v in case.mass_points.items()},
-                  sd, max(1, min(modes, T.shape[1])), case.damping, _single(K_parts),
-                  case.sensor_rows[~case.usable] @ T,
+                  sd, own, case.damping, single,
+                  case.sensor_rows[~case.usable] @ T, _mixing(T.T @ case.M @ low, frequencies, own), links,
+                  _doubling(case, frequencies, links @ (T.T @ case.M @ low)),
                   damping_sd=max(0.25, case.tolerances["damping_rel_sd"]))
+
+
+def _mixing(rows: Array, frequencies: Array, modes: int) -> Array:
+    """(n, modes + 1): M φ ω; zero where there is no further mode."""
+    out = np.zeros((len(rows), modes + 1))
+    known = min(modes + 1, rows.shape[1])
+    out[:, :known] = rows[:, :known] * (2 * np.pi * frequencies[:known])
+    return out
+
+
+def _doubling(case: Case, frequencies: Array, rows: Array) -> Array:
+    """(D,): N s/m at which a dashpot along each row (D, modes) doubles the nominal damping of the mode in the band it affects most."""
+    inside = frequencies < ABOVE * case.band[1]
+    added = rows[:, inside] ** 2 / (4 * np.pi * frequencies[inside])
+    return np.asarray(case.damping / np.maximum(added.max(axis=1, initial=0.0), 1e-300))
 
 
 def _single(parts: Array) -> dict[int, Array]:
@@ -162,16 +225,22 @@ def solve(fam: Family, theta: Array) -> Modes:
     import scipy.linalg as la
 
     count_k, count = len(fam.K_parts), len(fam.names)
+    detuned, damped, driven, dashed, mixed = np.split(theta[count:], [*(np.arange(1, 4) * fam.modes), 3 * fam.modes + len(fam.dashpots)])
     scale = np.exp(np.clip(theta[:count], -6, 6))
     K = np.tensordot(scale[:count_k], fam.K_parts, 1) + fam.K_rest
+    form = np.zeros((fam.modes + 1, fam.modes + 1))
+    form[fam.pairs] = np.clip(mixed, -0.3, 0.3)
+    K = K + fam.mixing @ (form + form.T) @ fam.mixing.T
     M = np.tensordot(scale[count_k:], fam.M_parts, 1) + fam.M_rest
     values, basis = la.eigh(K, M)
     omega = np.sqrt(np.maximum(values, 1e-6))
     undisturbed = omega.copy()
     zeta = np.full(len(omega), fam.damping)
-    omega[:fam.modes] *= np.exp(np.clip(theta[count:count + fam.modes], -0.3, 0.3))
-    zeta[:fam.modes] *= np.exp(np.clip(theta[count + fam.modes:], -4, 4))
-    return Modes(omega, zeta, basis, undisturbed)
+    omega[:fam.modes] *= np.exp(np.clip(detuned, -0.3, 0.3))
+    zeta[:fam.modes] *= np.exp(np.clip(damped, -4, 4))
+    force = np.ones(len(omega))
+    force[:fam.modes] += np.clip(driven, -0.5, 0.5)
+    return Modes(omega, zeta, basis, undisturbed, force, fam.dashpot * np.clip(dashed, -5, 5))
 
 
 @final
@@ -208,18 +277,36 @@ class Fields:
 def fields(fam: Family, modes: Modes, s: Complex, attach: tuple[Attachment, ...] = (), most: int = 45) -> Fields:
     """Accelerance and the modal vectors to both sides of it (exact with attachments, by the Woodbury identity)."""
     D = modes.denominators(s)
-    f, S = fam.shaker @ modes.basis, fam.sensors @ modes.basis
+    f, S = (fam.shaker @ modes.basis) * modes.driven, fam.sensors @ modes.basis
     right = f / D
     if not attach:
         H = s[:, None] ** 2 * (right @ S.T)
-        return Fields(H, right[:, :most], S[None, :, :most] / D[:, None, :most], modes)
+        return _corrected(fam, Fields(H, right[:, :most], S[None, :, :most] / D[:, None, :most], modes), s)
     left = S[None] / D[:, None, :]
     b = np.array([a.direction for a in attach]) @ modes.basis
     gain = coupling(modes, s, attach)
     back = gain @ (b[None] / D[:, None, :])                                        # (L, K, m)
     right, left = right - ((right @ b.T)[:, None, :] @ back)[:, 0], left - (left @ b.T) @ back
     H = s[:, None] ** 2 * (right @ S.T)
-    return Fields(H, right[:, :most], left[:, :, :most], modes)
+    return _corrected(fam, Fields(H, right[:, :most], left[:, :, :most], modes), s)
+
+
+def _corrected(fam: Family, fld: Fields, s: Complex) -> Fields:
+    """Coupling of the modes by dashpots added to the accelerance, to first order."""
+    at = np.flatnonzero(fld.modes.viscous)
+    if len(at) == 0:
+        return fld
+    return replace(fld, H=fld.H + np.tensordot(fld.modes.viscous[at], dashpot_columns(fam, fld, s, at), 1))
+
+
+def dashpot_columns(fam: Family, fld: Fields, s: Complex, at: NDArray[np.intp]) -> Complex:
+    """(len(at), L, S): change of the accelerance per N s/m of dashpots, what it does to each mode's own damping apart (that has its own
+    deviation already)."""
+    rows = fam.dashpots[at] @ fld.modes.basis[:, :fld.right.shape[1]]
+    out = np.empty((len(at), *fld.H.shape), dtype=complex)
+    for k, b in enumerate(rows):
+        out[k] = (fld.right @ b)[:, None] * (fld.left @ b) - (fld.left @ (fld.right * b ** 2)[:, :, None])[:, :, 0]
+    return np.asarray(-(s ** 3)[:, None] * out)
 
 
 def coupling(modes: Modes, s: Complex, attach: tuple[Attachment, ...]) -> Complex:
@@ -279,8 +366,28 @@ def jacobian(fam: Family, theta: Array, fld: Fields, s: Complex) -> Complex:
     detune = 2 * omega ** 2 + 2 * zeta * omega * s[:, None]
     damp = 2 * zeta * omega * s[:, None]
     out[count:count + fam.modes] = np.moveaxis(-s2[:, None] * detune[:, :, None] * own, 1, 0)
-    out[count + fam.modes:] = np.moveaxis(-s2[:, None] * damp[:, :, None] * own, 1, 0)
+    out[count + fam.modes:fam.moving] = np.moveaxis(-s2[:, None] * damp[:, :, None] * own, 1, 0)
+    pushed = fld.left[:, :, :fam.modes] * (fam.shaker @ basis[:, :fam.modes])
+    out[fam.moving:fam.moving + fam.modes] = np.moveaxis(s2[:, None] * pushed, 2, 0)
+    if len(fam.dashpots):
+        joined = fam.moving + fam.modes + np.arange(len(fam.dashpots))
+        out[joined] = fam.dashpot[:, None, None] * dashpot_columns(fam, fld, s, np.arange(len(fam.dashpots)))
+    out[fam.size - len(fam.pairs[0]):] = _mixing_columns(fam, fld, s, near, turned[0])
     return out
+
+
+def _mixing_columns(fam: Family, fld: Fields, s: Complex, near: int, turned: tuple[Array, Array]) -> Complex:
+    """(pairs, L, S): derivative to the stiffness between the nominal modes of each pair."""
+    rows = fam.mixing.T @ fld.modes.basis[:, :fld.right.shape[1]]
+    left, right = np.moveaxis(fld.left @ rows.T, 2, 0), (fld.right @ rows.T).T[:, :, None]
+    i, j = fam.pairs
+    out = left[i] * right[j] + left[j] * right[i]
+    still, moving = turned
+    low, low_right = fld.left[:, :, :near], fld.right[:, :near]
+    for k, (a, b) in enumerate(zip(rows[i, :near], rows[j, :near], strict=True)):
+        A = np.outer(a, b) + np.outer(b, a)
+        out[k] += (low @ (low_right @ (A * still) + s[:, None] * (low_right @ (A * moving)))[:, :, None])[:, :, 0]
+    return np.asarray(-(s ** 2)[:, None] * out)
 
 
 def _turning(fam: Family, modes: Modes, near: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -299,6 +406,10 @@ def _turning(fam: Family, modes: Modes, near: int) -> tuple[tuple[Array, Array],
 
 
 def shape_columns(fam: Family, fld: Fields, s: Complex) -> Complex:
-    """Contribution (modes, L, S) of each mode to each channel: what a relative error of the mode shape there changes."""
-    S = fam.sensors @ fld.modes.basis[:, :fam.modes]
-    return np.asarray(np.moveaxis((s ** 2)[:, None, None] * fld.right[:, :fam.modes, None] * S.T[None], 1, 0))
+    """Contribution (modes + BEYOND, L, S) of each mode to each channel, modes beyond the band in groups: what a relative error of the mode
+    shape there changes."""
+    S = fam.sensors @ fld.modes.basis[:, :fld.right.shape[1]]
+    each = np.moveaxis((s ** 2)[:, None, None] * fld.right[:, :, None] * S.T[None], 1, 0)
+    m = fam.modes
+    rest = [each[m + i] if m + i < len(each) else np.zeros_like(each[0]) for i in range(BEYOND - 1)]
+    return np.concatenate([each[:m], np.stack([*rest, each[m + BEYOND - 1:].sum(axis=0)])])

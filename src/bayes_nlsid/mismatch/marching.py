@@ -46,7 +46,7 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
         if not paths.periodic:
             break
         sizes = np.abs(state).max(axis=1, keepdims=True) + 1e-300
-        change = float((np.abs(state - begun) / sizes).max())
+        change = float((np.abs(state - begun) * steps.lasting / sizes).max())
         closed = change < 0.03
         if change < 2e-3:
             break

@@ -51,7 +51,8 @@ QUICK = 2.0  # rad per step beyond which a mode is taken as a spring
 class Steps:
     """One step of a march: ``own``, ``forced`` (4, m), ``b`` (J, m) and ``yielding`` (J, J) as in ``simulation.modal_march``.
 
-    ``back`` (2, K, m): modal x and ẋ under a unit force, in these very steps, one step earlier.
+    ``back`` (2, K, m): modal x and ẋ under a unit force, in these very steps, one step earlier. ``lasting`` (m,): share of a period
+    over which a wrong start of a mode is felt.
     """
 
     own: Array
@@ -59,6 +60,7 @@ class Steps:
     b: Array
     yielding: Array
     back: Complex
+    lasting: Array
 
 
 @final
@@ -120,7 +122,8 @@ class Bed:
         high = self.rows[:, ~low] / self.modes.omega[~low]
         own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)
         back = _steady(own, forced, np.exp(self.s * dt)) if self.periodic else np.zeros((2, 0, 0), dtype=complex)
-        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back)
+        fading = np.maximum(self.modes.zeta[low] * self.modes.omega[low] * self.samples * self.dt, 1e-12)
+        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back, -np.expm1(-fading) / fading)
 
     def linear(self, record: int) -> Complex:
         """(K, J): motion without any law."""

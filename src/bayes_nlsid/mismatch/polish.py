@@ -1,8 +1,8 @@
-"""Joint estimation of the last rivals: laws and linear parameters together, by forward simulation.
+"""Rivals on one scale: linear effects estimated with the linear model, laws fitted where joint estimation (``joint``) begins.
 
 Given the linear model, the law's parameters move so that the simulated force explains the projected residual (Gauss–Newton with derivatives
-of the self-consistent simulation); given the law, the transfer function it leaves is calibrated anew. The two alternate; both costs
-are parts of one −2 log likelihood, on which all rivals are compared.
+of the self-consistent simulation); what it leaves of the transfer function is for the linear model to explain. Both costs are parts of
+one −2 log likelihood, on which all rivals are compared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, calibrate, descend, finish, floored, predict
+from bayes_nlsid.mismatch.calibrate import Chain, Extension, LinearFit, coarse, descend, finish, floored, predict, strained
 from bayes_nlsid.mismatch.effects import Effect, LinearKind, extension, law_of, linear_kind, pack, packed, unpack, weakened
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
@@ -27,8 +27,8 @@ from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-FAINT, FAINT_CHARGE = 0.01, 60.0  # change of response below which a linear effect is charged, and how much
-STARTS, WEAKER = 4, 0.5  # weaker starts that are tried, and by how much each is weaker than the one before
+FAINT, FAINT_CHARGE = 0.01, 20.0  # change of response below which a linear effect is charged, and how much
+WEAKER = 4  # starts that are tried, each half as strong as the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
 
@@ -161,69 +161,62 @@ def paths_to_sensors(bench: Bench, fit: LinearFit, places: list[str], s: Complex
     attach, chain = parts
     out = receptances(modes, s, fam.sensors, rows, attach)
     m = fam.modes
-    S, b = (fam.sensors @ modes.basis)[:, :m] * fit.shape_errors, (rows @ modes.basis)[:, :m]
+    S, b = (fam.sensors @ modes.basis)[:, :m] * fit.shape_errors[:, :m], (rows @ modes.basis)[:, :m]
     out = out + np.einsum("lm,sm,jm->lsj", 1 / modes.denominators(s)[:, :m], S, b, optimize=True)
     out = s[:, None, None] ** 2 * out
     return np.asarray(out if chain is None else np.moveaxis(chain.apply(np.moveaxis(out, 2, 0)), 0, 2))
 
 
-def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], rounds: int = 5,
-             globally: bool = False) -> Hypothesis:
-    """Joint estimation of up to two effects; see the module.
+def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]) -> Hypothesis:
+    """Estimation of effects none of which is a force, together with the linear model.
 
     Parameters
     ----------
     start : linear fit to begin from.
     candidates : effects with starting values from the first search.
-    globally : start the calibration anew where the law leaves a transfer function that the present one does not fit.
     """
     fam, evidence = bench.family, bench.evidence
+    effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
+    s, variance = evidence.spectra.s[evidence.excited], floored(evidence.H, evidence.variance)
+    begin = [(start.theta, x)]
+    if ext is not None and strained(fam, start.theta, sd):
+        begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
+    ends = [descend(fam, t, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03) for t, y in begin]
+    theta, x, _ = min(ends, key=lambda e: e[2])
+    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
+    return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
+
+
+def _prepared(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]
+              ) -> tuple[tuple[Effect, ...], tuple[LinearKind, ...], Extension | None, Array, Array]:
+    """Effects, their linear kinds and extension, prior of the linear model beside them, starting values of the extension."""
     effects = tuple(c.effect for c in candidates)
     kinds = tuple(kind_of(bench, c) for c in candidates if not c.effect.is_force and c.effect.cls != "linear_stiffness")
     ext = extension(kinds, len(bench.channels))
-    sd = widened(fam, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
+    sd = widened(bench.family, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
+    x = np.zeros(0) if ext is None else ext.x
+    if ext is not None and len(start.x) and len(start.x) <= len(x):
+        x = np.concatenate([start.x, x[len(start.x):]])
+    return effects, kinds, ext, sd, x
+
+
+def begin(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], steps: int = 2, weaker: int = WEAKER) -> Hypothesis:
+    """Laws fitted to the projected residual with the linear model held at ``start``: where joint estimation begins.
+
+    ``weaker``: how often weaker starts are tried.
+    """
+    fam, evidence = bench.family, bench.evidence
+    effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
     forces = tuple(e for e in effects if e.is_force)
     spectra = evidence.spectra
-    s = spectra.s[spectra.excited]
-    variance = floored(evidence.H, evidence.variance)
-    theta = start.theta
-    x = np.zeros(0) if ext is None else ext.x
-    if ext is not None and len(start.x) and len(start.x) < len(x):
-        x = np.concatenate([start.x, x[len(start.x):]])
-    if not forces:
-        theta, x, _ = descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=x, tol=0.03)
-        fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
-        return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
-    unique = repeats(spectra)
-    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
-    reference, damping = forces, 1e-2
-    warm: tuple[Complex, ...] | None = None
-    best: tuple[float, Hypothesis] | None = None
-    for turn in range(rounds):
-        forces, warm, damping, misfit, normal, lines, h, status = _fit_laws(bench, fit, ext, x, forces, reference, unique, warm, damping)
-        shadow = np.stack([evidence.shadow(lines[:, :, j]) for j in range(len(forces))], axis=-1)[spectra.excited]
-        cleaned = evidence.H + np.einsum("lsj,lj->ls", h[spectra.excited], shadow)
-        theta, x, _ = descend(fam, fit.theta, s, cleaned, variance, 6, prior_sd=sd, extension=ext, x=x, tol=0.1)
-        new = finish(fam, theta, s, cleaned, variance, ext, x, sd)
-        if globally and turn in (0, 3) and ext is None and new.cost > 1.3 * new.dof:
-            # the law took away what had bent the calibration: look for its basin anew
-            other = calibrate(fam, s, cleaned, evidence.variance, restarts=3)
-            if other.cost < new.cost:
-                theta, x, _ = descend(fam, other.theta, s, cleaned, variance, 6, prior_sd=sd, tol=0.1)
-                new = finish(fam, theta, s, cleaned, variance, None, x, sd)
-        residual = evidence.residual + np.einsum(
-            "lsj,rlj->rls", h, np.stack([evidence.project(lines[:, :, j]) for j in range(len(forces))], axis=-1), optimize=True)
-        found = hypothesis(bench, _merge(effects, forces), kinds, new, misfit, normal, residual, status, force_strengths(bench, h, lines))
-        if best is None or found.cost < best[0]:
-            better = best is None or best[0] - found.cost > 1.0 + 1e-3 * found.cost
-            best = (found.cost, found)
-            if not better and turn > 1:
-                break
-        elif turn > 1:
-            break
-        fit = new
-    assert best is not None
-    return best[1]
+    s, variance = spectra.s[spectra.excited], floored(evidence.H, evidence.variance)
+    forces, misfit, normal, lines, h, status = _fit_laws(bench, start, ext, x, forces, repeats(spectra), steps, weaker)
+    shadow = np.stack([evidence.shadow(lines[:, :, j]) for j in range(len(forces))], axis=-1)[spectra.excited]
+    cleaned = evidence.H + np.einsum("lsj,lj->ls", h[spectra.excited], shadow)
+    fit = finish(fam, start.theta, s, cleaned, variance, ext, x, sd, spread=start.spread, rounds=0)
+    residual = evidence.residual + np.einsum(
+        "lsj,rlj->rls", h, np.stack([evidence.project(lines[:, :, j]) for j in range(len(forces))], axis=-1), optimize=True)
+    return hypothesis(bench, _merge(effects, forces), kinds, fit, misfit, normal, residual, status, force_strengths(bench, h, lines))
 
 
 def kind_of(bench: Bench, candidate: Candidate) -> LinearKind:
@@ -245,7 +238,8 @@ def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKin
     free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
     linear = _linear_strengths(bench, kinds, effects, fit)
     faint = FAINT_CHARGE * np.maximum(np.log(FAINT / np.maximum(linear, 1e-9)), 0.0) ** 2
-    charge = free * np.log(max(bench.evidence.H.size, 2)) + float(faint.sum())
+    chosen = sum(k.other >= 0 for k in kinds) * np.log(max(len(bench.channels) - 1, 1))    # the leaking one, among all others
+    charge = free * np.log(max(bench.evidence.H.size, 2)) + 2 * chosen + float(faint.sum())
     named, edges, strengths = [], 0, []
     remaining, pushing, pulling = list(kinds), list(() if forces is None else forces), list(linear)
     for e in effects:
@@ -309,11 +303,10 @@ def _transfer(bench: Bench, fit: LinearFit, theta: Array, ext: Extension | None,
     return fld.H if chain is None else chain.apply(fld.H)
 
 
-def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, forces: tuple[Effect, ...], reference: tuple[Effect, ...],
-              unique: list[int], warm: tuple[Complex, ...] | None, damping: float, steps: int = 2
-              ) -> tuple[tuple[Effect, ...], tuple[Complex, ...], float, float, Array, Complex, Complex, str]:
+def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, forces: tuple[Effect, ...], unique: list[int], steps: int,
+              weaker: int) -> tuple[tuple[Effect, ...], float, Array, Complex, Complex, str]:
     """A few Gauss–Newton steps of the law parameters against the projected residual, the linear model held."""
-    fam, evidence = bench.family, bench.evidence
+    fam, evidence, reference, damping = bench.family, bench.evidence, forces, 1e-2
     spectra = evidence.spectra
     places = [e.place for e in forces]
     rows = np.array([fam.places[p] for p in places])
@@ -334,18 +327,18 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         return tuple(unpack(e, y[a:b], ref) for e, ref, a, b in zip(forces, reference, edges[:-1], edges[1:], strict=True))
 
     y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
-    now = simulate(paths, spectra, forces, unique, warm)
+    now = simulate(paths, spectra, forces, unique, None)
     rest = data - response(now.lines)
     cost = float((np.abs(rest) ** 2).sum())
-    for _ in range(STARTS if warm is None else 0):
+    for _ in range(weaker):
         # the first search saw the law on the motion without it: a strong one moves its place less, or otherwise
-        weaker = tuple(weakened(e, WEAKER) for e in forces)
-        there = simulate(paths, spectra, weaker, unique, None)
+        less_of_it = tuple(weakened(e, 0.5) for e in forces)
+        there = simulate(paths, spectra, less_of_it, unique, None)
         left = data - response(there.lines)
         less = float((np.abs(left) ** 2).sum())
         if not less < cost:
             break
-        forces, now, rest, cost = weaker, there, left, less
+        forces, now, rest, cost = less_of_it, there, left, less
         y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
     normal = np.eye(len(y))
     for _ in range(steps):
@@ -374,4 +367,4 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         cost = new
         if gain < 1e-3 * cost:
             break
-    return effects_at(y), now.motions, damping, cost, normal, now.lines, h, now.status
+    return effects_at(y), cost, normal, now.lines, h, now.status

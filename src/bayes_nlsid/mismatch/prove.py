@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.case import Case, CaseRecord
 from bayes_nlsid.mismatch.effects import law_of
-from bayes_nlsid.mismatch.linear import Family, Modes, receptances, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, Modes, fields, receptances, shape_columns, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Hypothesis, day
@@ -54,7 +54,7 @@ class Predictor:
     def silent(self, case: Case, record: CaseRecord) -> Array:
         """Accelerations (n, S') of the channels that were left out, as the model has them."""
         fam = replace(self.family, sensors=self.family.silent)
-        fit = None if self.fit is None else replace(self.fit, shape_errors=np.zeros((len(fam.sensors), fam.modes)))
+        fit = None if self.fit is None else replace(self.fit, shape_errors=np.zeros((len(fam.sensors), len(fam.error_sd))))
         return replace(self, family=fam, fit=fit, clip=(), chained=False).run(case, record)[0]
 
     def run(self, case: Case, record: CaseRecord) -> tuple[Array, str]:
@@ -67,7 +67,7 @@ class Predictor:
         F = np.fft.rfft(waveform) / block
         parts = ((), None) if self.hypothesis is None else self.hypothesis.parts(self.channels)(s)
         errors = None if self.fit is None else self.fit.shape_errors
-        Y = accelerance(fam, modes, s, fam.shaker[None], errors, parts[0])[:, :, 0] * F[:, None]
+        Y = driven(fam, modes, s, F, errors, parts[0])
         status = "ok"
         forces = () if self.hypothesis is None else self.hypothesis.forces
         if forces:
@@ -88,12 +88,25 @@ class Predictor:
         return out, status
 
 
-def accelerance(fam: Family, modes: Modes, s: Complex, rows: Array, errors: Array | None, attach: tuple) -> Complex:
+def driven(fam: Family, modes: Modes, s: Complex, force: Complex, errors: Array | None, attach: tuple[Attachment, ...], most: int = 2000
+           ) -> Complex:
+    """(L, S) accelerations to the shaker's force (L,), with all that calibration has corrected; lines without force are left at zero."""
+    out = np.zeros((len(s), len(fam.sensors)), dtype=complex)
+    lines = np.flatnonzero(np.abs(force) > 1e-7 * np.abs(force).max(initial=0.0))
+    for at in np.array_split(lines, len(lines) // most + 1):
+        local = tuple(replace(a, z=a.z[at]) for a in attach)
+        fld = fields(fam, modes, s[at], local)
+        H = fld.H if errors is None else fld.H + np.einsum("mls,sm->ls", shape_columns(fam, fld, s[at]), errors, optimize=True)
+        out[at] = H * force[at, None]
+    return out
+
+
+def accelerance(fam: Family, modes: Modes, s: Complex, rows: Array, errors: Array | None, attach: tuple[Attachment, ...]) -> Complex:
     """(L, S, J) from forces along ``rows`` to the channels, shape errors included."""
     out = receptances(modes, s, fam.sensors, rows, attach)
     if errors is not None:
         m = fam.modes
-        S, b = (fam.sensors @ modes.basis)[:, :m] * errors, (rows @ modes.basis)[:, :m]
+        S, b = (fam.sensors @ modes.basis)[:, :m] * errors[:, :m], (rows @ modes.basis)[:, :m]
         products = (S[:, None, :] * b[None]).reshape(-1, m)
         out = out + ((1 / modes.denominators(s)[:, :m]) @ products.T).reshape(out.shape)
     return np.asarray(s[:, None, None] ** 2 * out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.effects import Effect
+from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
-from bayes_nlsid.mismatch.joint import refine
-from bayes_nlsid.mismatch.polish import Bench, Hypothesis, estimate, everywhere
+from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, everywhere
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
+CHARGED = 6.0  # the same for each parameter: less than what it will be charged
 
 
 @final
@@ -50,18 +51,13 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     ``others`` are calibrations to one level, where some laws sleep: forces are looked for with all of them.
     """
     none = bench.evidence.chi2 + fit.cost
-    forces, latents, _ = scan_forces(bench.family, fit, bench.evidence, places)
-    begin = fit
-    for other in others:
-        found, more, _ = scan_forces(bench.family, other, bench.evidence, places)
-        if found and found[0].gain > (forces[0].gain if forces else 0.0):
-            forces, latents, begin = found, more, other
+    forces, latents, starts = _pooled(bench, (fit, *others), places)
     linear = scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
     short = _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
-    singles = sorted((estimate(bench, begin, (c,), rounds=3) for c in short), key=lambda h: h.cost)
+    singles = _pursued(bench, [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short])
     # a law that explains more than any linear effect could makes those superfluous as first effects
     linear_too = top_linear > 0.15 * top_force and (not singles or 1.5 * top_linear > none - singles[0].cost)
     if linear_too:
@@ -75,30 +71,68 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         centre = 1.5 * float(np.sqrt(band[0] * band[1]))
         slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
         singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
-    for other in (fit, *others):
-        # the leaders also from the other calibrations: a law that was strong has bent some of them
-        if other is not begin and singles and _poor(bench, singles[0]):
-            singles = _better(singles, [estimate(bench, other, (c,), rounds=3) for c in short[:2]])
+    singles, finished = _promising(bench, singles, short)
     if not linear_too and latents and singles and singles[0].misfit_records > 2 * bench.evidence.values:
-        say("trying strong laws where a free force explains most")
         where = max(latents, key=lambda x: x.explained).place
-        starts = forced(bench.family, fit, bench.evidence, where, bench.sizes[where], 0.4)
-        tried = sorted((estimate(bench, fit, (c,), rounds=1) for c in starts), key=lambda h: h.cost)[:2]
-        singles = _better(singles, [estimate(bench, h.fit, _lead(h), rounds=3) for h in tried])
-    singles = _promising(bench, singles, short, none)
+        if where != singles[0].effects[0].place:
+            say("trying strong laws where a free force explains most")
+            tried = forced(bench.family, fit, bench.evidence, where, bench.sizes[where], 0.4)
+            singles = _better(singles, _pursued(bench, [begin(bench, fit, (c,)) for c in tried], most=2))
     singles = _again(bench, singles, places, none, say)
-    singles = _finish_leaders(bench, singles, none)
+    singles = _finish_leaders(bench, singles, none, finished)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
         doubles = _second(bench, singles[0], places, band, none - singles[0].cost)
         before = singles[0]
-        singles = _better(singles, _members(bench, singles[0], doubles))
+        singles = _better(singles, _members(bench, singles[0], doubles, none - singles[0].cost))
         if singles[0] is not before:
             say("a member of a pair leads alone: looking for a second effect beside it")
-            singles = _finish_leaders(bench, singles, none)
+            singles = _finish_leaders(bench, singles, none, finished)
             doubles = _better(doubles, _second(bench, singles[0], places, band, none - singles[0].cost))
     return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
+
+
+def _pooled(bench: Bench, fits: tuple[LinearFit, ...], places: list[str]
+            ) -> tuple[list[Candidate], list[Latent], dict[tuple[str, str], LinearFit]]:
+    """Force candidates by several calibrations, the best of each law and place, with the calibration it was found by; latent forces of the
+    first."""
+    pool: dict[tuple[str, str], tuple[Candidate, LinearFit]] = {}
+    first: list[Latent] = []
+    for i, fit in enumerate(fits):
+        found, latents, _ = scan_forces(bench.family, fit, bench.evidence, places)
+        first = latents if i == 0 else first
+        for c in found:
+            if c.effect.key not in pool or c.gain > pool[c.effect.key][0].gain:
+                pool[c.effect.key] = (c, fit)
+    return sorted((c for c, _ in pool.values()), key=lambda c: -c.gain), first, {k: f for k, (_, f) in pool.items()}
+
+
+def _begun(bench: Bench, c: Candidate, starts: Sequence[LinearFit]) -> Hypothesis:
+    """Where a law begins, by the calibration from which it leaves least of the projected residual."""
+    different = [f for i, f in enumerate(starts) if all(f is not g for g in starts[:i])]
+    return min((begin(bench, f, (c,)) for f in (different if strong(bench.evidence) else different[:1])), key=lambda h: h.misfit_records)
+
+
+def _pursued(bench: Bench, begun: list[Hypothesis], most: int = 5) -> list[Hypothesis]:
+    """Laws estimated jointly from where they began, of strong ones only those that began best."""
+    order = sorted(begun, key=lambda h: h.misfit_records)
+    many = most if strong(bench.evidence) else len(order)
+    return _better(order, [pursue(bench, h) for h in order[:many]])
+
+
+def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], most: int = 3
+               ) -> tuple[list[Hypothesis], dict[tuple[str, str], float]]:
+    """All derivatives for the laws that lead and the one that promised most in the first search, where much is left: the linear model
+    that a strong law has bent comes back with them only. With the cost of those that need no more."""
+    if not singles or not strong(bench.evidence) or not _poor(bench, singles[0], 1.2):
+        return singles, {}
+    promised = {c.effect.key: c.gain for c in short}
+    forces = [h for h in singles if h.forces and len(h.effects) == 1]
+    first = sorted(forces, key=lambda h: -promised.get(h.effects[0].key, 0.0))[:1]
+    chosen = first + [h for h in forces if h is not first[0]][:most - 1]
+    refined = [refine(bench, h, steps=8) for h in chosen]
+    return _better(singles, refined), {h.effects[0].key: h.cost for h in refined}
 
 
 def _unique(candidates: list[Candidate]) -> list[Candidate]:
@@ -111,9 +145,17 @@ def _unique(candidates: list[Candidate]) -> list[Candidate]:
     return out
 
 
+def _worth(c: Candidate) -> bool:
+    """Whether a candidate gains more than chance gives to as many parameters."""
+    e = c.effect
+    free = len(pack(e)) if e.is_force else 3 if e.cls == "unmodelled_mode" else 2 if e.kind == "maxwell" else 1
+    return c.gain > max(WORTH, CHARGED * free)
+
+
 def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> list[Candidate]:
     """The best laws over all places, and every law worth a look at the best place."""
-    if not candidates or candidates[0].gain < WORTH:
+    candidates = [c for c in candidates if _worth(c)]
+    if not candidates:
         return []
     top = candidates[0]
     keep = [c for c in _unique(candidates) if c.gain > max(WORTH, 0.2 * top.gain, 0.2 * other)]
@@ -132,7 +174,8 @@ def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> l
 
 def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]:
     """The best linear effects by their columns (relaxing branches apart)."""
-    if not candidates or candidates[0].gain < WORTH:
+    candidates = [c for c in candidates if _worth(c)]
+    if not candidates:
         return []
     limit = max(WORTH, 0.15 * candidates[0].gain)
     return [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
@@ -156,16 +199,15 @@ def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: flo
     """
     for _ in range(turns):
         lead = singles[0] if singles else None
-        if lead is None or len(lead.forces) != 1 or none - lead.cost < 200 or not _poor(bench, lead):
+        if lead is None or len(lead.forces) != 1 or none - lead.cost < 200 or not _much_left(bench, lead):
             break
         say("looking again at the motion that the leading law brings about")
-        lead = refine(bench, lead, steps=3)
         paths, motions = everywhere(bench, lead, places)
         forces, _, _ = scan_forces(bench.family, lead.fit, bench.evidence, places, None, paths, motions)
         top = forces[0].gain if forces else 0.0
         own = lead.effects[0]
         fresh = [c for c in _unique(forces) if c.gain > 0.5 * top and (c.effect.key != own.key or c.effect.law is not own.law)]
-        tried = [estimate(bench, lead.fit, (c,), rounds=3) for c in fresh[:4]]
+        tried = _pursued(bench, [begin(bench, lead.fit, (c,)) for c in fresh[:4]], most=2)
         new = _better([lead, *singles], tried)
         won = new[0].cost < lead.cost - 1.0
         singles = new
@@ -174,24 +216,19 @@ def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: flo
     return singles
 
 
-def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], none: float, most: int = 3) -> list[Hypothesis]:
-    """Joint iterations for the laws that promised most in the first search, where much is left: alternating estimation of a strong law
-    may end far from its optimum, behind a law of the wrong class that happened to begin well."""
-    if not singles or none - singles[0].cost < 200 or not _poor(bench, singles[0]):
-        return singles
-    promised = {c.effect.key: c.gain for c in short}
-    limit = 0.5 * (none - singles[0].cost)
-    worth = [h for h in singles if h.forces and len(h.effects) == 1 and promised.get(h.effects[0].key, 0.0) > limit]
-    order = sorted(worth, key=lambda h: -max(promised[h.effects[0].key], none - h.cost))
-    return _better(singles, [refine(bench, h, steps=6) for h in order[:most]])
+def _much_left(bench: Bench, h: Hypothesis) -> bool:
+    """Whether a law leaves half the noise, and some of what no linear model explains, unexplained."""
+    values = bench.evidence.values
+    return h.misfit_records - values > max(0.5 * values, 0.05 * (bench.evidence.chi2 - values))
 
 
-def _poor(bench: Bench, h: Hypothesis) -> bool:
-    return h.misfit_records > 1.02 * bench.evidence.values or h.fit.cost > 1.1 * h.fit.dof
+def _poor(bench: Bench, h: Hypothesis, limit: float = 1.02) -> bool:
+    return h.misfit_records > limit * bench.evidence.values or h.fit.cost > (limit + 0.08) * h.fit.dof
 
 
-def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> list[Hypothesis]:
-    """Joint iterations for the force hypotheses that are still in the race and leave a misfit; more rounds for the others."""
+def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float, finished: dict[tuple[str, str], float]) -> list[Hypothesis]:
+    """Joint iterations for the force hypotheses that are still in the race and leave a misfit, unless that was done (``finished``: at what
+    cost); quick ones for the others."""
     if not singles or none - singles[0].cost < 30:
         return singles
     gain = none - singles[0].cost
@@ -199,10 +236,12 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float) -> lis
     for i, h in enumerate(singles):
         poor = _poor(bench, h)
         if h.forces and i < 3 and h.cost - singles[0].cost < 0.3 * gain:
-            if poor and gain > 200 and i < 2:
+            if finished.get(h.effects[0].key) == h.cost and not (i == 0 and _much_left(bench, h)):
+                pass
+            elif poor and gain > 200 and i < 2:
                 h = refine(bench, h, steps=10)
             else:
-                h = min((h, estimate(bench, h.fit, tuple(Candidate(e, 0.0) for e in h.effects), rounds=4)), key=lambda z: z.cost)
+                h = refine(bench, h, steps=4, quick=True)
         out.append(h)
     return sorted(out, key=lambda z: z.cost)
 
@@ -216,25 +255,33 @@ def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[floa
             if c.gain > max(40.0, 0.002 * gained) and c.effect.key not in own]
     lead = _lead(first)
     out = []
-    for c in sorted(pool, key=lambda c: -c.gain)[:4]:
+    for c in sorted(pool, key=lambda c: -c.gain)[:3 if strong(bench.evidence) else 4]:
         pair = (*lead, c)
         start = first.fit
         if not first.forces and c.effect.is_force:
             pair = (c, *lead)
-        out.append(estimate(bench, start, pair, rounds=3))
+        out.append(_paired(bench, start, pair))
     return sorted(out, key=lambda h: h.cost)
 
 
-def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis]) -> list[Hypothesis]:
-    """Members of the best pairs, each alone from where the pair has left it: what leads may lead only because its rival began badly."""
+def _paired(bench: Bench, start: LinearFit, pair: tuple[Candidate, ...]) -> Hypothesis:
+    """Joint estimation of a pair whose first member is known."""
+    if not any(c.effect.is_force for c in pair):
+        return estimate(bench, start, pair)
+    return refine(bench, begin(bench, start, pair, steps=1, weaker=0), steps=4, quick=True)
+
+
+def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis], gained: float) -> list[Hypothesis]:
+    """Members of the best pairs, each alone from where the pair has left it, if the pair gains much: what leads may lead only because its
+    rival began badly."""
     out: dict[tuple[str, str], Hypothesis] = {}
     for pair in sorted(doubles, key=lambda h: h.cost)[:2]:
-        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof):
+        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof, 0.1 * gained):
             break
         for candidate in _lead(pair):
             key = candidate.effect.key
             if key not in out and key != lead.effects[0].key:
-                out[key] = estimate(bench, pair.fit, (candidate,), rounds=3)
+                out[key] = estimate(bench, pair.fit, (candidate,))
     return list(out.values())
 
 
