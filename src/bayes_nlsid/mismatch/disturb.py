@@ -107,11 +107,12 @@ def _quiet_blocks(case: Case, seconds: float = 1.0) -> tuple[Complex, Array] | N
 
 
 def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
-    """Power at mains harmonics over power at neighbouring lines, in every record."""
-    ratios: list[Array] = []
+    """Power at mains harmonics over power at neighbouring lines, pooled over the records: a tone is in all of them."""
+    gains: list[Array] = []
     sizes: list[Array] = []
     for harmonic in (1, 2, 3):
         f = harmonic * case.mains
+        ratios: list[Array] = []
         if spectra is not None and spectra.kind == "steady":
             line = f * spectra.block / spectra.rate
             k = int(np.argmin(np.abs(spectra.lines - line)))
@@ -127,14 +128,15 @@ def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
             Y, frequency = quiet
             k = int(np.argmin(np.abs(frequency - f)))
             near = np.array([k + i for i in range(-10, 11) if abs(i) > 1 and 0 < k + i < len(frequency)])
-            power = (np.abs(Y[:, k]) ** 2).mean(0)
-            ratios.append(power / (np.abs(Y[:, near]) ** 2).mean((0, 1)))
-            sizes.append(np.sqrt(2 * power))
-    if not ratios:
+            power = np.abs(Y[:, k]) ** 2
+            ratios += list(power / (np.abs(Y[:, near]) ** 2).mean((0, 1)))
+            sizes.append(np.sqrt(2 * power.mean(0)))
+        if ratios:
+            gains.append(np.maximum(excess(np.mean(ratios, axis=0), len(ratios)) - 1.0, 0))
+    if not gains:
         return []
     names = np.array(case.sensors)[case.usable]
-    table = np.array(ratios)                                                       # (tests, S)
-    gain = np.maximum(excess(table, 1.0) - 0.6, 0).sum(0)
+    gain = np.sum(gains, axis=0)
     share = gain / max(gain.max(), 1e-9)
     size = np.sqrt((np.array(sizes) ** 2).mean(0))
     if len(names) > 1 and np.median(gain) > 40 and np.median(share) > 0.02:
