@@ -141,8 +141,8 @@ def _bench(case: Case, fam: Family, fit: LinearFit, evidence: Evidence) -> Bench
 
 
 def _one_level(fam: Family, evidence: Evidence) -> tuple[LinearFit, ...]:
-    """Calibrations to the lowest level alone, to the highest alone, and to all as far as the mean is not bent by what is not linear."""
-    found = [level_transfer(evidence, loud) for loud in (False, True)] + [(evidence.H, evidence.doubted(evidence.residual))]
+    """Calibrations to the lowest level alone, and to all levels as far as the mean is not bent by what is not linear."""
+    found = [level_transfer(evidence), (evidence.H, evidence.doubted(evidence.residual))]
     return tuple(calibrate(fam, evidence.spectra.s[evidence.excited], *f, restarts=4) for f in found if f is not None)
 
 

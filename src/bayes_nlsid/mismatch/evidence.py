@@ -125,15 +125,14 @@ def gather(spectra: Spectra, band: tuple[float, float], mains: float = 0.0) -> E
     return Evidence(spectra, trust, weight, residual, H[excited], variance_H, statistic, odd, even, by_record)
 
 
-def level_transfer(evidence: Evidence, loud: bool = False) -> tuple[Complex, Array] | None:
-    """Transfer function and variance (Le, S) of the records of the lowest level, where most laws sleep, or of the highest (``loud``),
-    where dry friction is least; None if there is one level only."""
+def level_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:
+    """Transfer function and variance (Le, S) of the records of the lowest level, where most laws sleep; None if there is one level only."""
     spectra = evidence.spectra
     low = spectra.levels < 0.5 * spectra.levels.max()
     if not low.any() or low.all():
         return None
     e = evidence.excited
-    low = spectra.levels > 0.99 * spectra.levels.max() if loud else spectra.levels < 1.01 * spectra.levels.min()
+    low = spectra.levels < 1.01 * spectra.levels.min()
     F, Y, trust = spectra.force[low][:, e], spectra.response[low][:, e], evidence.trust[low]
     power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)
     H = np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power[:, None]

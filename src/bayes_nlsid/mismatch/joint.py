@@ -74,8 +74,8 @@ class Joint:
         return tuple(unpack(e, y[a:b], e) for e, a, b in zip(self.forces, self.edges[:-1], self.edges[1:], strict=True))
 
     def at(self, y: Array, theta: Array, x: Array, errors: Array, warm: tuple[Complex, ...] | None, most: int = 40,
-           coarse: bool = False) -> Point:
-        """Simulate all records at these parameters."""
+           coarse: bool = False, search: bool = True) -> Point:
+        """Simulate all records at these parameters; in a ``search`` a march that is not sound will do."""
         bench, evidence = self.bench, self.bench.evidence
         spectra = evidence.spectra
         modes = solve(bench.family, theta)
@@ -84,7 +84,7 @@ class Joint:
         fld = replace(self.h.fit.fields, modes=modes)
         fit = replace(self.h.fit, fields=fld, shape_errors=errors)
         h = paths_to_sensors(bench, fit, self.places, spectra.s, parts(spectra.s))
-        there = simulate(paths.coarse if coarse else paths, spectra, self.effects(y), self.unique, warm, most=most)
+        there = simulate(paths.coarse if coarse else paths, spectra, self.effects(y), self.unique, warm, most=most, march_only=search)
         projected = np.stack([evidence.project(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)
         residual = (evidence.residual + np.einsum("lsj,rlj->rls", h, projected, optimize=True)) * self.root
         shadow = np.stack([evidence.shadow(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)[evidence.excited]
@@ -167,7 +167,7 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5, quick: bool = False, dou
         if gain < 1e-4 * cost and not stale:
             break
         kept = None if gain < 0.02 * cost else kept
-    now = joint.at(y, theta, x, errors, now.motions)
+    now = joint.at(y, theta, x, errors, now.motions, search=doubt)
     if doubt:
         joint.variance = floored(bench.evidence.H, bench.evidence.variance)
     fit = joint.fit(now, theta, x)

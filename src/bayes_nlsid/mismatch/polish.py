@@ -107,7 +107,7 @@ class Simulated:
 
 
 def simulate(paths: Bed, spectra: Spectra, effects: tuple[Effect, ...], unique: list[int], start: tuple[Complex, ...] | None,
-             tolerance: float = 1e-5, most: int = 40) -> Simulated:
+             tolerance: float = 1e-5, most: int = 40, march_only: bool = False) -> Simulated:
     """Steady forces of all effects in every record; records with one force history are computed once (``unique``)."""
     times = day(spectra, spectra.starts)
     drifting = any(e.law is None for e in effects)
@@ -120,7 +120,7 @@ def simulate(paths: Bed, spectra: Spectra, effects: tuple[Effect, ...], unique: 
             motions.append(motions[same])
             continue
         laws = tuple(law_of(e, times[r], paths.periodic) for e in effects)
-        D, G, state = settle(paths, r, laws, None if start is None else start[r], tolerance=tolerance, most=most)
+        D, G, state = settle(paths, r, laws, None if start is None else start[r], tolerance=tolerance, most=most, march_only=march_only)
         status = status if state == "ok" else state
         out[r] = G[spectra.lines]
         motions.append(D)
@@ -327,13 +327,13 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         return tuple(unpack(e, y[a:b], ref) for e, ref, a, b in zip(forces, reference, edges[:-1], edges[1:], strict=True))
 
     y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
-    now = simulate(paths, spectra, forces, unique, None)
+    now = simulate(paths, spectra, forces, unique, None, march_only=True)
     rest = data - response(now.lines)
     cost = float((np.abs(rest) ** 2).sum())
     for _ in range(weaker):
         # the first search saw the law on the motion without it: a strong one moves its place less, or otherwise
         less_of_it = tuple(weakened(e, 0.5) for e in forces)
-        there = simulate(paths, spectra, less_of_it, unique, None)
+        there = simulate(paths, spectra, less_of_it, unique, None, march_only=True)
         left = data - response(there.lines)
         less = float((np.abs(left) ** 2).sum())
         if not less < cost:
@@ -343,10 +343,11 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     normal = np.eye(len(y))
     for _ in range(steps):
         columns = np.empty((len(y), *rest.shape), dtype=complex)
-        still = simulate(paths.coarse, spectra, effects_at(y), unique, now.motions, most=12)
+        still = simulate(paths.coarse, spectra, effects_at(y), unique, now.motions, most=12, march_only=True)
         for i in range(len(y)):
             step = 1e-3
-            moved = simulate(paths.coarse, spectra, effects_at(y + step * (np.arange(len(y)) == i)), unique, now.motions, most=12)
+            there = effects_at(y + step * (np.arange(len(y)) == i))
+            moved = simulate(paths.coarse, spectra, there, unique, now.motions, most=12, march_only=True)
             columns[i] = (response(moved.lines) - response(still.lines)) / step
         flat, r = columns.reshape(len(y), -1), rest.ravel()
         normal = (flat.conj() @ flat.T).real + 1e-2 * np.eye(len(y))
@@ -354,8 +355,8 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         accepted = False
         for _ in range(4):
             trial = y + np.clip(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), -0.7, 0.7)
-            there = simulate(paths, spectra, effects_at(trial), unique, now.motions)
-            left = data - response(there.lines)
+            tried = simulate(paths, spectra, effects_at(trial), unique, now.motions, march_only=True)
+            left = data - response(tried.lines)
             new = float((np.abs(left) ** 2).sum())
             if np.isfinite(new) and new < cost:
                 accepted = True
@@ -363,7 +364,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
             damping = max(8 * damping, 1e-3)
         if not accepted:
             break
-        gain, y, now, rest, damping = cost - new, trial, there, left, max(damping / 8, 1e-6)
+        gain, y, now, rest, damping = cost - new, trial, tried, left, max(damping / 8, 1e-6)
         cost = new
         if gain < 1e-3 * cost:
             break

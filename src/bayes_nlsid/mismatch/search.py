@@ -55,7 +55,9 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     linear = scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
-    short = _short_forces(forces, top_linear)
+    # what no law moves by a fiftieth is no law's doing, however far it stands above the noise
+    hopeless = strong(bench.evidence) and top_force < 0.02 * (bench.evidence.chi2 - bench.evidence.values)
+    short = [] if hopeless else _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
     singles = _pursued(bench, [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short])
     # a law that explains more than any linear effect could makes those superfluous as first effects
@@ -115,10 +117,21 @@ def _begun(bench: Bench, c: Candidate, starts: Sequence[LinearFit]) -> Hypothesi
 
 
 def _pursued(bench: Bench, begun: list[Hypothesis], most: int = 5) -> list[Hypothesis]:
-    """Laws estimated jointly from where they began, of strong ones only those that began best."""
+    """Laws estimated jointly from where they began, of strong ones only those that began well."""
     order = sorted(begun, key=lambda h: h.misfit_records)
     many = most if strong(bench.evidence) else len(order)
-    return _better(order, [pursue(bench, h) for h in order[:many]])
+    out: list[Hypothesis] = []
+    for h in order[:many]:
+        if not _beaten(bench, h, out, 4.0):
+            out.append(pursue(bench, h))
+    return _better(order, out)
+
+
+def _beaten(bench: Bench, h: Hypothesis, others: list[Hypothesis], times: float) -> bool:
+    """Whether a strong law leaves so many times more unexplained than another that it will not catch up."""
+    values = bench.evidence.values
+    best = min((o.misfit_records for o in others), default=np.inf)
+    return strong(bench.evidence) and h.misfit_records - values > times * max(best - values, 0.2 * values)
 
 
 def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], most: int = 3
@@ -130,7 +143,7 @@ def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], 
     promised = {c.effect.key: c.gain for c in short}
     forces = [h for h in singles if h.forces and len(h.effects) == 1]
     first = sorted(forces, key=lambda h: -promised.get(h.effects[0].key, 0.0))[:1]
-    chosen = first + [h for h in forces if h is not first[0]][:most - 1]
+    chosen = [h for h in first + [h for h in forces if h is not first[0]][:most - 1] if not _beaten(bench, h, forces, 3.0)]
     refined = [refine(bench, h, steps=8) for h in chosen]
     return _better(singles, refined), {h.effects[0].key: h.cost for h in refined}
 
@@ -207,7 +220,7 @@ def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: flo
         top = forces[0].gain if forces else 0.0
         own = lead.effects[0]
         fresh = [c for c in _unique(forces) if c.gain > 0.5 * top and (c.effect.key != own.key or c.effect.law is not own.law)]
-        tried = _pursued(bench, [begin(bench, lead.fit, (c,)) for c in fresh[:4]], most=2)
+        tried = _pursued(bench, [begin(bench, lead.fit, (c,)) for c in fresh[:4]], most=1)
         new = _better([lead, *singles], tried)
         won = new[0].cost < lead.cost - 1.0
         singles = new
