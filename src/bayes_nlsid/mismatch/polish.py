@@ -346,8 +346,8 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         still = simulate(paths.coarse, spectra, effects_at(y), unique, now.motions, most=12, march_only=True)
         for i in range(len(y)):
             step = 1e-3
-            there = effects_at(y + step * (np.arange(len(y)) == i))
-            moved = simulate(paths.coarse, spectra, there, unique, now.motions, most=12, march_only=True)
+            beside = effects_at(y + step * (np.arange(len(y)) == i))
+            moved = simulate(paths.coarse, spectra, beside, unique, now.motions, most=12, march_only=True)
             columns[i] = (response(moved.lines) - response(still.lines)) / step
         flat, r = columns.reshape(len(y), -1), rest.ravel()
         normal = (flat.conj() @ flat.T).real + 1e-2 * np.eye(len(y))
