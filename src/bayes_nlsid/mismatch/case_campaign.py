@@ -60,7 +60,7 @@ def needs_general(path: str | Path) -> bool:
     if not isinstance(meta.get("band_hz"), list):
         return True
     period, rate = float(meta.get("period_s") or 0.0), float(meta.get("fs_hz") or 0.0)
-    steady, bursts = 0, 0
+    steady, bursts, moving = 0, 0, 0
     for entry in meta["records"]:
         name = str(entry.get("name", "")) if isinstance(entry, dict) else ""
         file = folder / f"{name}.npz"
@@ -79,10 +79,9 @@ def needs_general(path: str | Path) -> bool:
         if not np.abs(force).any():
             return True   # a free decay
         steady += kind == "steady" and _repeats(force, round(period * rate))
-        if kind == "burst" and _under_way(force):
-            return True   # neither periodic nor from rest to rest
+        moving += kind == "burst" and _under_way(force)   # neither periodic nor from rest to rest
         bursts += kind == "burst"
-    return steady == 0 and bursts < 2
+    return steady == 0 and (bursts < 2 or moving > 0)
 
 
 def _repeats(force: Array, block: int) -> bool:
