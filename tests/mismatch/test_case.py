@@ -10,6 +10,7 @@ import pytest
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.mismatch import Diagnosis, read_case, write_diagnosis
+from bayes_nlsid.mismatch.case_campaign import needs_general
 from bayes_nlsid.mismatch.diagnosis import Named
 
 RATE, PERIOD = 256.0, 1.0
@@ -108,3 +109,18 @@ def test_the_answer_is_written_as_agreed(tmp_path: Path) -> None:
         assert store["s_accel_q50"].shape == (4, 2)
     with pytest.raises(ValueError, match="sum"):
         Diagnosis("x", 1, 2.0, "none", 0.1, {}, hypotheses[:1], {}, "", {})
+
+
+def test_a_periodic_campaign_with_a_burst_that_does_not_end_stays_where_it_belongs(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    meta = json.loads((folder / "case.json").read_text())
+    period = round(meta["period_s"] * meta["fs_hz"])
+    wave = rng.normal(size=period)
+    rest = {"time": np.arange(2 * period) / meta["fs_hz"], "accel": rng.normal(size=(2 * period, 2))}
+    np.savez(folder / "burst.npz", force=rng.normal(size=2 * period), **rest)
+    burst = {"name": "burst", "kind": "burst random", "level": 1.0, "start_s": 0.0, "sealed": False}
+    change(folder, records=[burst])
+    assert needs_general(folder)
+    np.savez(folder / "steady.npz", force=np.tile(wave, 2), **rest)
+    change(folder, records=[burst, {"name": "steady", "kind": "steady multisine", "level": 1.0, "start_s": 0.0, "sealed": False}])
+    assert not needs_general(folder)
