@@ -275,8 +275,8 @@ BY_HAND = _layer("set by hand before any fit",
                  visible=1.0, visible_second=1.5, strength=0.5, regret=1.0, small_regret=0.3, second=1.0, second_share=0.3,
                  second_of_rest=1.0, gain_of_best=0.0, visible_of_best=-1.0, unexplained=0.8, held=0.5, linear_leftover=0.5)
 FITTED = _layer("fitted on 68 cases of studies/concealed (seeds 201 and 4711, periodic ones), moved by 50 of 62 cases of seed 6001, then "
-                "with errors of form in the linear model, by 91 cases of that seed (normal prior of width 0.25 around the weights before): log "
-                "loss there 1.23 on cases left out",
+                "with errors of form in the linear model, by 91 cases of that seed (normal prior of width 0.25 around the weights "
+                "before): log loss there 1.23 on cases left out",
                 none=0.818, other=-1.458, pair=-3.191, lag=0.0, steps_behind=0.141, relative_lag=0.816, gain_of_force=0.246,
                 gain_of_attachment=0.081, gain_of_channel=0.0, gain_of_incoherent=0.451, gain_of_pair=0.550, gain_of_other=0.068,
                 visible=1.994, visible_second=0.419, strength=0.643, regret=0.843, small_regret=0.080, second=0.003, second_share=0.0,
