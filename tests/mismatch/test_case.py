@@ -12,6 +12,7 @@ from bayes_nlsid.errors import InputError
 from bayes_nlsid.mismatch import Diagnosis, read_case, write_diagnosis
 from bayes_nlsid.mismatch.case_campaign import needs_general
 from bayes_nlsid.mismatch.diagnosis import Named
+from bayes_nlsid.mismatch.disturb import _hum
 
 RATE, PERIOD = 256.0, 1.0
 
@@ -124,3 +125,25 @@ def test_a_periodic_campaign_with_a_burst_that_does_not_end_stays_where_it_belon
     np.savez(folder / "steady.npz", force=np.tile(wave, 2), **rest)
     change(folder, records=[burst, {"name": "steady", "kind": "steady multisine", "level": 1.0, "start_s": 0.0, "sealed": False}])
     assert not needs_general(folder)
+
+
+@pytest.mark.parametrize("sort", ["noise", "tone", "ringing"])
+def test_mains_hum_is_heard_where_bursts_have_died_away(folder: Path, sort: str) -> None:
+    """A tone that is there in the quiet end of every burst; a mode that rings down there is none."""
+    rng = np.random.default_rng(1)
+    n = 2048
+    time = np.arange(n) / RATE
+    records = []
+    for i in range(4):
+        force = np.where(time < 1.0, rng.normal(size=n), 0.0)
+        accel = rng.normal(size=(n, 3)) * (1.0 + 20 * (time < 2.0)[:, None])
+        if sort != "noise":
+            accel[:, 1] += np.cos(2 * np.pi * 50.0 * time + i) * (1.0 if sort == "tone" else 300 * np.exp(-0.9 * time))
+        np.savez(folder / f"burst_{i}.npz", time=time, force=force, accel=accel)
+        records.append({"name": f"burst_{i}", "kind": "burst", "level": 1.0, "start_s": 10.0 * i, "sealed": False})
+    change(folder, records=records, mains_hz=50.0)
+    found = _hum(read_case(folder), None)
+    if sort == "tone":
+        assert found[0].place == "S2" and found[0].gain > 100
+    else:
+        assert not found or found[0].gain < 12

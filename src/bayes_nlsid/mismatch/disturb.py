@@ -106,6 +106,21 @@ def _quiet_blocks(case: Case, seconds: float = 1.0) -> tuple[Complex, Array] | N
     return np.fft.rfft(pieces, axis=1) / block, np.arange(block // 2 + 1) * case.rate / block
 
 
+def _tails(case: Case) -> list[tuple[Complex, Array]]:
+    """DFT/n of the last two seconds (2, K, S) of every burst that has ended by then, and their frequencies, windowed."""
+    out = []
+    block = round(case.rate)
+    window = np.hanning(block)[:, None] / 0.5
+    for r in case.records:
+        if r.sealed or r.kind != "burst" or len(r.accel) < 4 * block:
+            continue
+        if np.abs(r.force[-2 * block:]).max() < 0.02 * np.abs(r.force).max():
+            pieces = r.accel[-2 * block:, case.usable].reshape(2, block, -1)
+            out.append((np.fft.rfft(window * (pieces - pieces.mean(axis=1, keepdims=True)), axis=1) / block,
+                        np.arange(block // 2 + 1) * case.rate / block))
+    return out
+
+
 def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
     """Power at mains harmonics over power at neighbouring lines, pooled over the records: a tone is in all of them."""
     gains: list[Array] = []
@@ -131,6 +146,14 @@ def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
             power = np.abs(Y[:, k]) ** 2
             ratios += list(power / (np.abs(Y[:, near]) ** 2).mean((0, 1)))
             sizes.append(np.sqrt(2 * power.mean(0)))
+        for Y, frequency in _tails(case):
+            if f < 0.45 * case.rate:
+                k = int(np.argmin(np.abs(frequency - f)))
+                near = np.array([k + i for i in range(-10, 11) if abs(i) > 1 and 0 < k + i < len(frequency)])
+                power = np.abs(Y[:, k]) ** 2
+                # what rings down is not a tone
+                ratios.append(np.where(power[1] > 0.7 * power[0], power[1] / (np.abs(Y[1][near]) ** 2).mean(0), 1.0))
+                sizes.append(np.sqrt(2 * power[1]))
         if ratios:
             gains.append(np.maximum(excess(np.mean(ratios, axis=0), len(ratios)) - 1.0, 0))
     if not gains:

@@ -23,7 +23,7 @@ from bayes_nlsid.mismatch.search import Found, search
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Progress = Callable[[str], None]
-FAINT, FAINT_PLACE = 8.0, 18.0  # gains that the best of all channels, or of all places, has by chance
+FAINT, FAINT_PLACE = 12.0, 18.0  # gains that the best of all channels, or of all places, has by chance
 TRIED = 10  # rivals that are run on the records kept aside
 
 
