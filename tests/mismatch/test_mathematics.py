@@ -376,3 +376,9 @@ def test_bands_cover_nine_tenths_and_elpd_knows_the_better_model() -> None:
     gain, se = elpd_difference(measured, poor, true, worse, bands, 100.0)
     assert gain > 5 * se > 0
     assert nrmse(measured, true) < nrmse(measured, poor)
+
+
+def test_distortion_without_any_hypothesis_is_something_else_not_nothing() -> None:
+    assert probabilities(Scores(())) == {(): 1.0}
+    lost = probabilities(Scores((), unexplained=1.0))
+    assert lost[(("other", "-"),)] > 0.9 and sum(lost.values()) == pytest.approx(1.0)

@@ -160,8 +160,8 @@ def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival
     leftover = found.none if best is None else best.misfit_records + best.fit.cost
     above = max(evidence.chi2 - evidence.values, 0.0)
     unexplained = 0.0
-    if above > 12 * np.sqrt(2 * evidence.values) and best is not None:
-        unexplained = float(np.clip((best.misfit_records - evidence.values) / above, 0, 1))
+    if above > 12 * np.sqrt(2 * evidence.values):
+        unexplained = 1.0 if best is None else float(np.clip((best.misfit_records - evidence.values) / above, 0, 1))
     linear = (fit if best is None else best.fit).cost / fit.dof
     return Scores(items, unexplained, float(max(leftover / total, 1.0)), float(linear), held_none)
 

@@ -111,7 +111,8 @@ class Score:
 class Scores:
     """All hypotheses of a case.
 
-    ``unexplained``: share of the distortion above noise that the best hypothesis leaves (0 if there is none).
+    ``unexplained``: share of the distortion above noise that the best hypothesis leaves (0 if there is no distortion, 1 if there is no
+    hypothesis for it).
     ``dispersion``: leftover chi² per degree of freedom of the best hypothesis; ``linear``: the same of its transfer function alone;
     ``held``: of the calibrated linear model on records not fitted, as ``Score.held``.
     """
@@ -214,7 +215,7 @@ def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float
     They sum to one.
     """
     keys, table = features(scores)
-    if len(keys) == 2:
+    if len(keys) == 2 and not scores.unexplained > 0:
         return {(): 1.0}
     weights = np.array((layer or SHIPPED).weights)
     weight = _softmax(table @ weights + np.log([_prior(k) for k in keys]))

@@ -126,7 +126,9 @@ def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: lis
               say: Progress) -> list[Rival]:
     """Clipped channels, alone and together with what the unclipped evidence then shows."""
     out: list[Rival] = []
-    for channel, level in suspects(case, noise)[:2]:
+    lone = _lone_channel(case, bench.evidence)
+    flat = suspects(case, noise)
+    for channel, level in (lone + [s for s in flat if all(s[0] != c for c, _ in lone)])[:2]:
         say(f"undoing the clipping of {bench.channels[channel]}")
         level, cleaned, refit, cost = fit_clipping(bench.family, bench.evidence, fit, channel, level)
         gain = none - cost
@@ -143,6 +145,17 @@ def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: lis
                 key, sizes = _ordered([("clipping", name), *[e.key for e in h.effects]], [lost, *h.strengths])
                 out.append(Rival(key, none - h.cost - np.log(bench.evidence.H.size), gain, h, ((channel, level),), (effect,), sizes))
     return out
+
+
+def _lone_channel(case: Case, evidence: Evidence) -> list[tuple[int, float]]:
+    """The channel that has most of what is not linear to itself, and nearly its largest value: soft clipping leaves no flat top."""
+    power = 2 * np.einsum("r,ls,rls->s", evidence.trust, evidence.weight, np.abs(evidence.residual) ** 2)
+    beyond = np.maximum(power - evidence.values / len(power), 0.0)
+    channel = int(np.argmax(beyond))
+    if len(power) < 3 or beyond[channel] < 0.6 * beyond.sum() or beyond[channel] < 0.1 * evidence.values:
+        return []
+    largest = max(float(np.abs(r.accel[:, case.usable][:, channel]).max()) for r in case.records if not r.sealed and r.kind != "off")
+    return [(channel, 0.95 * largest)]
 
 
 def _clipped_share(evidence: Evidence, fit: LinearFit, channel: int, level: float) -> float:
