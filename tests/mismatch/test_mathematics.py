@@ -17,12 +17,13 @@ from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.krylov import gmres
 from bayes_nlsid.mismatch.laws import Size
-from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, shape_columns, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import LawAlong, bed
 from bayes_nlsid.mismatch.poles import pair, vector_fit
 from bayes_nlsid.mismatch.probability import Score, Scores, fit_layer, probabilities
 from bayes_nlsid.mismatch.prove import calibrate_bands, elpd_difference, nrmse
+from bayes_nlsid.mismatch.shapes import shape_columns
 from bayes_nlsid.mismatch.spectra import Spectra
 
 

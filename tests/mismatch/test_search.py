@@ -12,9 +12,10 @@ from bayes_nlsid.mismatch.effects import Effect
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.explain import Candidate, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, refine, strong
-from bayes_nlsid.mismatch.linear import fields, shape_columns, solve
+from bayes_nlsid.mismatch.linear import fields, solve
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Bench
+from bayes_nlsid.mismatch.shapes import shape_columns
 from tests.mismatch.test_mathematics import chain_family, cubic, steady
 
 BAND = (1.0, 170.0)

@@ -16,8 +16,9 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.linear import Attachment, Family, Fields, fields, jacobian, shape_columns, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, Fields, fields, jacobian, solve
 from bayes_nlsid.mismatch.poles import modal_start
+from bayes_nlsid.mismatch.shapes import shape_columns, with_shape_errors
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -225,7 +226,7 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
 
 def _price(gram: Array, C: Array, spread: Array, usual: Array) -> float:
     """What errors of shapes larger or smaller than usual cost: ratio of determinants and an inverse-gamma prior on each variance."""
-    if spread is usual or np.array_equal(spread, usual):
+    if np.array_equal(spread, usual):
         return 0.0
     ratio = (usual / spread) ** 2
     before = np.linalg.slogdet(gram + np.eye(len(usual)) / usual ** 2)[1].sum() + 2 * len(gram) * np.log(usual).sum()
@@ -299,7 +300,7 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
     prior = 1 / (fam.prior_sd if prior_sd is None else prior_sd) ** 2
     cost = system.chi2 + float(prior @ theta ** 2) + (extension.penalty(x) if extension is not None else 0.0)
     errors = system.effects
-    model = fld.H + np.einsum("mls,sm->ls", shape_columns(fam, fld, s), errors)
+    model = with_shape_errors(fam, fld, s, errors)
     model = model if chain is None else chain.apply(model)
     misfit = float(np.sqrt((np.abs(measured - model) ** 2 / variance).sum() / (np.abs(measured) ** 2 / variance).sum()))
     rest = system.gradient - np.concatenate([prior * theta, (x - extension.centre) / extension.prior_sd ** 2] if extension is not None

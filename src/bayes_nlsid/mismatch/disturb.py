@@ -121,6 +121,12 @@ def _tails(case: Case) -> list[tuple[Complex, Array]]:
     return out
 
 
+def _beside(frequency: Array, f: float) -> tuple[int, NDArray[np.intp]]:
+    """The line at a frequency, and those beside it that a windowed tone does not reach."""
+    k = int(np.argmin(np.abs(frequency - f)))
+    return k, np.array([k + i for i in range(-10, 11) if abs(i) > 1 and 0 < k + i < len(frequency)])
+
+
 def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
     """Power at mains harmonics over power at neighbouring lines, pooled over the records: a tone is in all of them."""
     gains: list[Array] = []
@@ -141,15 +147,13 @@ def _hum(case: Case, spectra: Spectra | None) -> list[Disturbance]:
         quiet = _quiet_blocks(case, 1.0)
         if quiet is not None and f < 0.45 * case.rate:
             Y, frequency = quiet
-            k = int(np.argmin(np.abs(frequency - f)))
-            near = np.array([k + i for i in range(-10, 11) if abs(i) > 1 and 0 < k + i < len(frequency)])
+            k, near = _beside(frequency, f)
             power = np.abs(Y[:, k]) ** 2
             ratios += list(power / (np.abs(Y[:, near]) ** 2).mean((0, 1)))
             sizes.append(np.sqrt(2 * power.mean(0)))
         for Y, frequency in _tails(case):
             if f < 0.45 * case.rate:
-                k = int(np.argmin(np.abs(frequency - f)))
-                near = np.array([k + i for i in range(-10, 11) if abs(i) > 1 and 0 < k + i < len(frequency)])
+                k, near = _beside(frequency, f)
                 power = np.abs(Y[:, k]) ** 2
                 # what rings down is not a tone
                 ratios.append(np.where(power[1] > 0.7 * power[0], power[1] / (np.abs(Y[1][near]) ** 2).mean(0), 1.0))

@@ -19,8 +19,9 @@ from bayes_nlsid.mismatch.catalogue import CATALOGUE
 from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.laws import Law, Size
-from bayes_nlsid.mismatch.linear import Family, Modes, receptances
+from bayes_nlsid.mismatch.linear import Family
 from bayes_nlsid.mismatch.paths import Bed, bed
+from bayes_nlsid.mismatch.shapes import accelerance
 from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]
@@ -66,18 +67,6 @@ class Latent:
     velocity: Array
 
 
-def sensor_paths(fam: Family, modes: Modes, s: Complex, places: list[str], errors: Array | None = None) -> Complex:
-    """Accelerance (L, S, J) from forces at places to the sensors, shape errors of the sensors included."""
-    rows = np.array([fam.places[p] for p in places])
-    out = receptances(modes, s, fam.sensors, rows)
-    if errors is not None:
-        m = fam.modes
-        S, b = (fam.sensors @ modes.basis)[:, :m] * errors[:, :m], (rows @ modes.basis)[:, :m]
-        inverse = 1 / modes.denominators(s)[:, :m]
-        out = out + np.einsum("lm,sm,jm->lsj", inverse, S, b, optimize=True)
-    return np.asarray(s[:, None, None] ** 2 * out)
-
-
 def sizes(paths: Bed, places: list[str], motions: Sequence[Complex] | None = None) -> dict[str, Size]:
     """Scales of motion at each place in the record where it moves most; ``motions`` (K, J) per record, the linear ones by default."""
     out = {}
@@ -107,7 +96,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
     paths = bed(modes, spectra, rows, fam.shaker) if paths is None else paths
     motions = [paths.linear(r) for r in range(len(spectra.names))] if motions is None else motions
     scale = sizes(paths, places, motions)
-    h = sensor_paths(fam, modes, spectra.s, places, fit.shape_errors)
+    h = accelerance(fam, modes, spectra.s, rows, fit.shape_errors)
     data = evidence.residual if residual is None else residual
     moved = [paths.in_time(D) for D in motions]
     candidates: list[Candidate] = []
@@ -148,7 +137,7 @@ def forced(fam: Family, fit: LinearFit, evidence: Evidence, place: str, size: Si
     top = int(np.argmax(spectra.levels))
     paths = bed(fit.fields.modes, spectra, fam.places[place][None], fam.shaker)
     d, v = paths.in_time(paths.linear(top))
-    h = sensor_paths(fam, fit.fields.modes, spectra.s, [place], fit.shape_errors)[:, :, 0]
+    h = accelerance(fam, fit.fields.modes, spectra.s, fam.places[place][None], fit.shape_errors)[:, :, 0]
     out = []
     for row in CATALOGUE:
         for law in row.laws[:1] if row.kind == "force" else ():

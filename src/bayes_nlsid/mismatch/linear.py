@@ -403,13 +403,3 @@ def _turning(fam: Family, modes: Modes, near: int) -> tuple[tuple[Array, Array],
     m_still = np.where(same, 0.0, (e[None, :] * w[:, None] - e[:, None] * w[None, :]) / gap)
     m_moving = np.where(same, np.diag(a / 2), (e[None, :] * a[:, None] - e[:, None] * a[None, :]) / gap)
     return (k_still, k_moving), (m_still, m_moving)
-
-
-def shape_columns(fam: Family, fld: Fields, s: Complex) -> Complex:
-    """Contribution (modes + BEYOND, L, S) of each mode to each channel, modes beyond the band in groups: what a relative error of the mode
-    shape there changes."""
-    S = fam.sensors @ fld.modes.basis[:, :fld.right.shape[1]]
-    each = np.moveaxis((s ** 2)[:, None, None] * fld.right[:, :, None] * S.T[None], 1, 0)
-    m = fam.modes
-    rest = [each[m + i] if m + i < len(each) else np.zeros_like(each[0]) for i in range(BEYOND - 1)]
-    return np.concatenate([each[:m], np.stack([*rest, each[m + BEYOND - 1:].sum(axis=0)])])

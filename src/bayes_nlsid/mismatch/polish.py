@@ -20,9 +20,10 @@ from bayes_nlsid.mismatch.effects import Effect, LinearKind, extension, law_of, 
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.laws import Size
-from bayes_nlsid.mismatch.linear import Attachment, Family, receptances
+from bayes_nlsid.mismatch.linear import Attachment, Family
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import Bed, bed
+from bayes_nlsid.mismatch.shapes import accelerance
 from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
 Array = NDArray[np.float64]
@@ -159,11 +160,7 @@ def paths_to_sensors(bench: Bench, fit: LinearFit, places: list[str], s: Complex
     fam, modes = bench.family, fit.fields.modes
     rows = np.array([fam.places[p] for p in places])
     attach, chain = parts
-    out = receptances(modes, s, fam.sensors, rows, attach)
-    m = fam.modes
-    S, b = (fam.sensors @ modes.basis)[:, :m] * fit.shape_errors[:, :m], (rows @ modes.basis)[:, :m]
-    out = out + np.einsum("lm,sm,jm->lsj", 1 / modes.denominators(s)[:, :m], S, b, optimize=True)
-    out = s[:, None, None] ** 2 * out
+    out = accelerance(fam, modes, s, rows, fit.shape_errors, attach)
     return np.asarray(out if chain is None else np.moveaxis(chain.apply(np.moveaxis(out, 2, 0)), 0, 2))
 
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.case import Case, CaseRecord
 from bayes_nlsid.mismatch.effects import law_of
-from bayes_nlsid.mismatch.linear import Attachment, Family, Modes, fields, receptances, shape_columns, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, Modes, fields, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Hypothesis, day
+from bayes_nlsid.mismatch.shapes import accelerance, with_shape_errors
 from bayes_nlsid.mismatch.spectra import Spectra
 
 Array = NDArray[np.float64]
@@ -96,20 +97,9 @@ def driven(fam: Family, modes: Modes, s: Complex, force: Complex, errors: Array 
     for at in np.array_split(lines, len(lines) // most + 1):
         local = tuple(replace(a, z=a.z[at]) for a in attach)
         fld = fields(fam, modes, s[at], local)
-        H = fld.H if errors is None else fld.H + np.einsum("mls,sm->ls", shape_columns(fam, fld, s[at]), errors, optimize=True)
+        H = fld.H if errors is None else with_shape_errors(fam, fld, s[at], errors)
         out[at] = H * force[at, None]
     return out
-
-
-def accelerance(fam: Family, modes: Modes, s: Complex, rows: Array, errors: Array | None, attach: tuple[Attachment, ...]) -> Complex:
-    """(L, S, J) from forces along ``rows`` to the channels, shape errors included."""
-    out = receptances(modes, s, fam.sensors, rows, attach)
-    if errors is not None:
-        m = fam.modes
-        S, b = (fam.sensors @ modes.basis)[:, :m] * errors[:, :m], (rows @ modes.basis)[:, :m]
-        products = (S[:, None, :] * b[None]).reshape(-1, m)
-        out = out + ((1 / modes.denominators(s)[:, :m]) @ products.T).reshape(out.shape)
-    return np.asarray(s[:, None, None] ** 2 * out)
 
 
 def _drive(case: Case, record: CaseRecord, modes: Modes) -> tuple[int, Array]:

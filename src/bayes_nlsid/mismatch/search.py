@@ -249,11 +249,10 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float, finish
     for i, h in enumerate(singles):
         poor = _poor(bench, h)
         if h.forces and i < 3 and h.cost - singles[0].cost < 0.3 * gain:
-            if finished.get(h.effects[0].key) == h.cost and not (i == 0 and _much_left(bench, h)):
-                pass
-            elif poor and gain > 200 and i < 2:
+            done = finished.get(h.effects[0].key) == h.cost and not (i == 0 and _much_left(bench, h))
+            if not done and poor and gain > 200 and i < 2:
                 h = refine(bench, h, steps=10)
-            else:
+            elif not done:
                 h = refine(bench, h, steps=4, quick=True)
         out.append(h)
     return sorted(out, key=lambda z: z.cost)
