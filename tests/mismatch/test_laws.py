@@ -32,7 +32,7 @@ def test_slopes_are_derivatives(law: Law) -> None:
 
 
 def test_every_law_of_a_class_means_what_the_class_says() -> None:
-    q, none = 1e-5 * np.linspace(0.01, 4, 200), np.zeros(200)
+    q, none = 1e-5 * np.linspace(0.01, 7, 350), np.zeros(350)
 
     def of(name: str) -> list[tuple[np.ndarray, np.ndarray]]:
         return [(np.asarray(law.term.static_force(q, none, p)), np.asarray(law.term.static_force(-q, none, p)))
@@ -44,6 +44,8 @@ def test_every_law_of_a_class_means_what_the_class_says() -> None:
         assert np.allclose(plus, -minus) and (np.diff(plus / q) < 0).all()
     for plus, minus in of("asymmetric"):
         assert np.abs(plus + minus).max() > 0.05 * max(np.abs(plus).max(), np.abs(minus).max())
+    for plus, minus in of("clearance"):   # two faces; contact on one side only is asymmetric
+        assert (plus >= 0).all() and (minus <= 0).all() and plus.max() > 0 > minus.min() and plus[0] < 1e-3 * plus.max()
     for name in ("coulomb", "quad_damping"):
         for law in ROWS[name].laws:
             for p in law.shapes(SIZE):

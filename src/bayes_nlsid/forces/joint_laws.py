@@ -52,6 +52,18 @@ def levelling_slope(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
     return k * r * (1.0 + m + r) / (1.0 + r) ** 2, 0.0
 
 
+def exponential_spring(q: Value, v: Value, k: Value, d: Value) -> Value:
+    """k (d sinh(q/d) − q), continued with its slope beyond 30 d, so that it cannot overflow."""
+    y = np.minimum(np.maximum(q / d, -30.0), 30.0)
+    return k * d * (np.sinh(y) - y + (q / d - y) * np.cosh(y))
+
+
+def exponential_spring_slope(q: Value, v: Value, k: Value, d: Value) -> Value:
+    """k (cosh(q/d) − 1)."""
+    y = np.minimum(np.maximum(q / d, -30.0), 30.0)
+    return k * (np.cosh(y) - where(np.abs(q / d) < 30.0, 1.0, 0.0)), 0.0
+
+
 def saturating(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
     """−k q r/(1 + r) with r = (|q|/d)^m."""
     return -levelling(q, v, k, d, m)

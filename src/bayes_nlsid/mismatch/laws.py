@@ -85,6 +85,12 @@ LEVELLING = Term("levelling_spring", "k*q*(abs(q)/d)**m/(1 + (abs(q)/d)**m)",
                   Param("m", "", "range", 0.5, 4.0, "sharpness")),
                  joint_laws.levelling, joint_laws.levelling_slope, meaning="spring that stiffens with displacement and levels off")
 
+EXPONENTIAL = Term("exponential_spring", "k*(d*sinh(q/d) - q)",
+                   (Param("k", "N/m", "stiffness", meaning="stiffness scale"),
+                    Param("d", "m", "displacement", meaning="motion over which stiffness grows by a factor")),
+                   joint_laws.exponential_spring, joint_laws.exponential_spring_slope,
+                   meaning="spring that stiffens exponentially with displacement, alike in both directions")
+
 SATURATING = Term("saturating_spring", "-k*q*(abs(q)/d)**m/(1 + (abs(q)/d)**m)",
                   (Param("k", "N/m", "stiffness", meaning="stiffness lost at large motion"),
                    Param("d", "m", "displacement", meaning="motion at which half of it is lost"),
@@ -99,7 +105,7 @@ FALLING = Term("falling_spring", "-f*sign(q)*(abs(q)/d)**n",
 
 ROUNDED_GAP = Term("rounded_gap", "k*w*e*(log(1 + exp((q - e)/(w*e))) - log(1 + exp((-q - e)/(w*e))))",
                    (Param("k", "N/m", "stiffness", meaning="stiffness in contact"), Param("e", "m", "displacement", meaning="gap"),
-                    Param("w", "", "range", 0.01, 0.6, "rounding over the gap")),
+                    Param("w", "", "range", 0.01, 0.3, "rounding over the gap")),
                    joint_laws.rounded_gap, joint_laws.rounded_gap_slope, meaning="gap on both sides with rough faces")
 
 ONE_STOP = Term("one_stop", "k*e*max(sign(k)*q/e - 1, 0)**n",
@@ -109,7 +115,7 @@ ONE_STOP = Term("one_stop", "k*e*max(sign(k)*q/e - 1, 0)**n",
 
 TWO_STOPS = Term("two_stops", "k*(max(q - e, 0) - r*max(-q - u*e, 0))",
                  (Param("k", "N/m", "stiffness", meaning="stiffness of the stop at e"), Param("e", "m", "displacement", meaning="gap"),
-                  Param("r", "", "range", 0.05, 20.0, "stiffness of the other stop over this one"),
+                  Param("r", "", "range", 0.15, 7.0, "stiffness of the other stop over this one"),
                   Param("u", "", "range", 0.2, 5.0, "gap on the other side over this one")),
                  joint_laws.two_stops, joint_laws.two_stops_slope, parity="none", meaning="unequal stops on both sides")
 
@@ -172,7 +178,8 @@ def _loop(p: Array) -> Array:
 HARDENING = (Law(POWER_SPRING, lambda z: _grid(np.array([1.0]), np.array([z.displacement]), np.array([2.0, 3.0, 4.0, 5.0])),
                  ("log", "fixed", "log"), (0,)),
              Law(LEVELLING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.7, 1.5, 3.0]), np.array([1.0, 2.0])),
-                 ("log", "log", "log"), (0,)))
+                 ("log", "log", "log"), (0,)),
+             Law(EXPONENTIAL, lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.5, 0.8, 1.3])), ("log", "log"), (0,)))
 SOFTENING = (Law(SATURATING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([0.5, 1.0, 2.0, 5.0]), np.array([1.0, 2.0])),
                  ("log", "log", "log"), (0,)),
              Law(FALLING, lambda z: _grid(np.array([1.0]), np.array([z.displacement]), np.array([2.0, 3.0])),
@@ -180,8 +187,6 @@ SOFTENING = (Law(SATURATING, lambda z: _grid(np.array([1.0]), z.displacement * n
 _GAPS = np.array([0.5, 1.2, 2.0, 3.0, 4.0, 5.0, 6.0])
 CLEARANCE = (Law(LIBRARY["clearance"], lambda z: _grid(np.array([1.0]), z.displacement * _GAPS), ("log", "log"), (0,)),
              Law(ROUNDED_GAP, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:5], np.array([0.1])), ("log", "log", "log"), (0,)),
-             Law(ONE_STOP, lambda z: _grid(np.array([1.0, -1.0]), z.displacement * _GAPS[:5], np.array([1.0, 1.5])),
-                 ("signed", "log", "log"), (0,)),
              Law(TWO_STOPS, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:4], np.array([0.3, 1.0]), np.array([0.6, 1.6])),
                  ("log", "log", "log", "log"), (0,)))
 ASYMMETRIC = (Law(ONE_SIDED, lambda z: _grid(np.array([1.0]), np.array([-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0]), np.array([z.displacement])),
@@ -189,7 +194,10 @@ ASYMMETRIC = (Law(ONE_SIDED, lambda z: _grid(np.array([1.0]), np.array([-2.0, -1
               Law(BENT, lambda z: _grid(np.array([1.0]), np.array([-0.7, 0.0, 0.7]), np.array([0.3, 1.0, 4.0]), np.array([z.displacement])),
                   ("signed", "linear", "log", "fixed"), (0,), signed=True),
               Law(CLOSING, lambda z: _grid(np.array([1.0]), z.displacement * np.array([-3.0, -1.0, 1.0, 3.0])), ("signed", "signed"), (0,),
-                  signed=True))
+                  signed=True),
+              # contact on one side only differs between the two directions, whatever its gap; a gap that closes has two faces
+              Law(ONE_STOP, lambda z: _grid(np.array([1.0, -1.0]), z.displacement * _GAPS[:5], np.array([1.0, 1.5])),
+                  ("signed", "log", "log"), (0,)))
 COULOMB = (Law(FRICTION, lambda z: _grid(np.array([1.0]), z.velocity * np.array([0.003, 0.02, 0.1, 0.3, 1.0])), ("log", "log"), (0,)),
            Law(SLOW_FRICTION, lambda z: _grid(np.array([1.0]), z.velocity * np.array([0.02, 0.1, 0.4]), np.array([0.4]),
                                         np.array([3.0, 10.0])),

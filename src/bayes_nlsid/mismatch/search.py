@@ -18,6 +18,7 @@ from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, everywhere
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
+SECOND = 25.0  # the same for a second effect
 CHARGED = 6.0  # the same for each parameter: less than what it will be charged
 
 
@@ -85,13 +86,13 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
-        doubles = _second(bench, singles[0], places, band, none - singles[0].cost)
+        doubles = _second(bench, singles[0], places, band)
         before = singles[0]
         singles = _better(singles, _members(bench, singles[0], doubles, none - singles[0].cost))
         if singles[0] is not before:
             say("a member of a pair leads alone: looking for a second effect beside it")
             singles = _finish_leaders(bench, singles, none, finished)
-            doubles = _better(doubles, _second(bench, singles[0], places, band, none - singles[0].cost))
+            doubles = _better(doubles, _second(bench, singles[0], places, band))
     return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
 
 
@@ -258,13 +259,17 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float, finish
     return sorted(out, key=lambda z: z.cost)
 
 
-def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float], gained: float) -> list[Hypothesis]:
-    """Pairs of the best single with what its residual still shows."""
+def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float]) -> list[Hypothesis]:
+    """Pairs of the best single with what its residual still shows.
+
+    A second effect must gain more than chance and than errors of the first law make: a fiftieth of what that leaves unexplained.
+    """
+    left = max(first.misfit_records - bench.evidence.values, 0.0) + max(first.fit.cost - first.fit.dof, 0.0)
     forces, _, _ = scan_forces(bench.family, first.fit, bench.evidence, places, first.residual)
     linear = scan_linear(bench.family, first.fit, bench.channels, bench.mass, bench.stiffness, band)
     own = {e.key for e in first.effects}
     pool = [c for c in _unique(forces)[:3] + _unique([c for c in linear if c.effect.kind != "maxwell"])[:4]
-            if c.gain > max(40.0, 0.002 * gained) and c.effect.key not in own]
+            if c.gain > max(SECOND, 0.02 * left) and c.effect.key not in own]
     lead = _lead(first)
     out = []
     for c in sorted(pool, key=lambda c: -c.gain)[:3 if strong(bench.evidence) else 4]:

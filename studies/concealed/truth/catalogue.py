@@ -150,12 +150,16 @@ def _stiffening(cls: str, rng: np.random.Generator, at: Place, length: float, ra
         x0 = length if number != 1 else max(length, at.d)
         return Formula(name, number, lambda x: _p(x, x0, power), 0.1 * k, (0.0, 200 * k), True)
     if cls == "clearance":
-        name, number = _pick(rng, ("rounded_two_sided", 20), ("round_body", 21), ("unequal_stops", 22), ("stop_with_loss", 23))
+        name, number = _pick(rng, ("rounded_two_sided", 20), ("round_bodies", 27), ("unequal_stops", 22), ("stops_with_loss", 28))
         gap = max(length, at.d)
-        second = {20: rng.uniform(0.02, 0.08), 21: 0.0, 22: rng.uniform(1.1, 1.6), 23: rng.uniform(0.1, 0.4) / at.v}[number]
+        second = {20: rng.uniform(0.02, 0.08), 27: 0.0, 22: rng.uniform(1.1, 1.6), 28: rng.uniform(0.1, 0.4) / at.v}[number]
         ratio = rng.uniform(0.5, 1.4)
         return Formula(name, number, lambda x: _p(x, gap, second, ratio), k, (0.0, 300 * k), True)
-    name, number = _pick(rng, ("rounded_bilinear", 24), ("closing_asperities", 25), ("even_saturating", 26))
+    # contact on one side only differs between the two directions, whatever the gap: a gap that closes has two faces
+    name, number = _pick(rng, ("rounded_bilinear", 24), ("closing_asperities", 25), ("even_saturating", 26), ("round_body", 21),
+                         ("stop_with_loss", 23))
     width = at.d * (rng.uniform(0.1, 0.4) if number == 24 else rng.uniform(1.5, 3.0))
     offset = at.d * rng.uniform(-0.6, 0.6)
-    return Formula(name, number, lambda x: _p(x, width, offset), 0.1 * k, (0.0, 20 * k), True)
+    if number in (21, 23):
+        width, offset = at.d * rng.uniform(0.2, 1.6), rng.uniform(0.1, 0.4) / at.v
+    return Formula(name, number, lambda x: _p(x, width, offset), 0.1 * k, (0.0, (20 if number in (24, 25, 26) else 300) * k), True)

@@ -43,6 +43,8 @@ def _elastic(kind, p, d):
         return a * p[1] * max(x - 1.0, 0.0) ** 1.5
     if kind == 22:  # two stops at unequal distances and stiffnesses
         return a * (max(d - p[1], 0.0) - p[3] * max(-d - p[2] * p[1], 0.0))
+    if kind == 27:  # round bodies on both sides
+        return a * p[1] * math.copysign(max(abs(x) - 1.0, 0.0) ** 1.5, x)
     if kind == 24:  # bilinear, rounded over p[1], about an offset p[2]
         y = d - p[2]
         return a * 0.5 * (math.sqrt(y * y + p[1] * p[1]) - math.sqrt(p[2] * p[2] + p[1] * p[1]))
@@ -88,11 +90,12 @@ def law(kind, p, d, v, modulation, h, old, new):
     new[0] = d
     if kind == 0:
         return p[0] * modulation * d
-    if kind == 23:  # stop with loss: contact force grows with approach speed
-        x = d / p[1] - 1.0
+    if kind == 23 or kind == 28:  # one stop, or one on each side, with loss: contact force grows with approach speed
+        side = math.copysign(1.0, d) if kind == 28 else 1.0
+        x = side * d / p[1] - 1.0
         if x <= 0.0:
             return 0.0
-        return p[0] * p[1] * x**1.5 * max(1.0 + p[2] * v, 0.0)
+        return side * p[0] * p[1] * x**1.5 * max(1.0 + side * p[2] * v, 0.0)
     if kind < 30:
         return _elastic(kind, p, d)
     if kind < 50:
