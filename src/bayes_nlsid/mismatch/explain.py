@@ -81,7 +81,7 @@ def sizes(paths: Bed, places: list[str], motions: Sequence[Complex] | None = Non
 
 
 def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[str], residual: Complex | None = None,
-                paths: Bed | None = None, motions: Sequence[Complex] | None = None
+                paths: Bed | None = None, motions: Sequence[Complex] | None = None, every: bool = False
                 ) -> tuple[list[Candidate], list[Latent], dict[str, Size]]:
     """All force laws and drifts at all places.
 
@@ -89,6 +89,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
     ----------
     residual : (R, L, S) projected residual to explain; that of ``evidence`` by default.
     paths, motions : bed of all places and the motions (K, J) there per record on which laws are tried; by default the linear ones.
+    every : return every law of a class, not only the best.
     """
     spectra = evidence.spectra
     modes = fit.fields.modes
@@ -110,12 +111,9 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
         latents.append(_latent(evidence, place, z, weight, total, moved, j, paths))
         for row in CATALOGUE:
             if row.kind == "force":
-                best: Candidate | None = None
-                for law in row.laws:
-                    one = _best_shape(evidence, law, law.shapes(scale[place]), paths, moved, j, z, weight, row.name, place)
-                    best = one if best is None or one.gain > best.gain else best
-                if best is not None and best.gain > 0:
-                    candidates.append(best)
+                tried = [_best_shape(evidence, law, law.shapes(scale[place]), paths, moved, j, z, weight, row.name, place)
+                         for law in row.laws]
+                candidates += [c for c in sorted(tried, key=lambda c: -c.gain)[:len(tried) if every else 1] if c.gain > 0]
         if np.ptp(spectra.starts) > 0:
             D = np.array([m[spectra.lines, j] for m in motions])
             # a stiffness of its own in every record: drifts may creep, jump or settle; their mean is the linear model's

@@ -83,6 +83,7 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
             singles = _better(singles, _pursued(bench, [begin(bench, fit, (c,)) for c in tried], most=2))
     singles = _again(bench, singles, places, none, say)
     singles = _finish_leaders(bench, singles, none, finished)
+    singles = _other_formulas(bench, singles, none, say)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
@@ -257,6 +258,30 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float, finish
                 h = refine(bench, h, steps=4, quick=True)
         out.append(h)
     return sorted(out, key=lambda z: z.cost)
+
+
+def _other_formulas(bench: Bench, singles: list[Hypothesis], none: float, say: Progress) -> list[Hypothesis]:
+    """The other laws of the leading classes, on the motion that the leaders bring about, where they leave more than chance.
+
+    The first search takes one law of each class by the motion without it, where formulas are hard to tell apart.
+    """
+    out: list[Hypothesis] = []
+    for h in singles[:2]:
+        e = h.effects[0]
+        left = h.misfit_records - bench.evidence.values
+        if len(h.effects) > 1 or e.law is None or left < 3 * np.sqrt(2 * bench.evidence.values) or (
+                h.cost - singles[0].cost > 0.1 * (none - singles[0].cost)):
+            continue
+        say(f"trying other laws of {e.cls}")
+        paths, motions = everywhere(bench, h, [e.place])
+        found, _, _ = scan_forces(bench.family, h.fit, bench.evidence, [e.place], None, paths, motions, every=True)
+        same = [c for c in found if c.effect.cls == e.cls]
+        for c in same:
+            if c.effect.law is not e.law and c.gain > 0.5 * same[0].gain:
+                tried = begin(bench, h.fit, (c,))
+                if not _beaten(bench, tried, [h], 4.0):
+                    out.append(refine(bench, tried, steps=6, quick=True))
+    return _better(singles, out)
 
 
 def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float]) -> list[Hypothesis]:
