@@ -105,7 +105,7 @@ FALLING = Term("falling_spring", "-f*sign(q)*(abs(q)/d)**n",
 
 ROUNDED_GAP = Term("rounded_gap", "k*w*e*(log(1 + exp((q - e)/(w*e))) - log(1 + exp((-q - e)/(w*e))))",
                    (Param("k", "N/m", "stiffness", meaning="stiffness in contact"), Param("e", "m", "displacement", meaning="gap"),
-                    Param("w", "", "range", 0.01, 0.3, "rounding over the gap")),
+                    Param("w", "", "range", 0.03, 0.3, "rounding over the gap")),
                    joint_laws.rounded_gap, joint_laws.rounded_gap_slope, meaning="gap on both sides with rough faces")
 
 ONE_STOP = Term("one_stop", "k*e*max(sign(k)*q/e - 1, 0)**n",
