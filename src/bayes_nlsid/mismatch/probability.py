@@ -33,7 +33,7 @@ FEATURES = (
     "second", "second share", "second of rest",     # what a second effect adds: against leftover, first gain, what the first left
     "gain of best", "visible of best",              # against nothing at all
     "unexplained", "held", "linear leftover",       # for something outside the catalogue
-    "attachment", "input or channel", "incoherent", "pair with attachment", "pair with incoherent",
+    "attachment", "input or channel", "incoherent", "pair with attachment", "pair with incoherent", "faint",
 )
 AT_LEAST_ZERO = {"lag", "steps behind", "relative lag", "gain of force", "gain of attachment", "gain of channel", "gain of incoherent",
                  "gain of pair", "gain of other", "visible", "visible second", "regret", "small regret", "second", "second share",
@@ -95,6 +95,8 @@ class Score:
         Leftover −2 log likelihood beyond its expectation.
     held : float
         Logarithm of the squared error on records that were not fitted over that of noise; NaN if not run.
+    faint : bool
+        Not estimated, since nothing speaks for it: the best place of a class that may be there, too weak to be seen.
     """
 
     key: Key
@@ -104,6 +106,7 @@ class Score:
     visible: float = float("nan")
     rest: float = 0.0
     held: float = float("nan")
+    faint: bool = False
 
 
 @final
@@ -129,8 +132,9 @@ def scores_from(stored: Mapping[str, Any]) -> Scores:
     def number(value: Any) -> float:
         return float("nan") if value is None else float(value)
 
-    items = tuple(Score(tuple((str(c), str(p)) for c, p in i["key"]),
-                        *(number(i[k]) for k in ("gain", "alone", "strength", "visible", "rest", "held"))) for i in stored["items"])
+    names = ("gain", "alone", "strength", "visible", "rest", "held")
+    items = tuple(Score(tuple((str(c), str(p)) for c, p in i["key"]), **{k: number(i[k]) for k in names}, faint=bool(i.get("faint", False)))
+                  for i in stored["items"])
     return Scores(items, *(number(stored[k]) for k in ("unexplained", "dispersion", "linear", "held")))
 
 
@@ -188,6 +192,7 @@ def _of_item(i: Score, best: float, scale: float, lowest: float) -> dict[str, fl
         row["attachment"] = float(group == "attachment")
         row["input or channel"] = float(group == "channel")
         row["incoherent"] = float(group == "incoherent")
+        row["faint"] = float(i.faint)
     return row
 
 
@@ -282,5 +287,6 @@ FITTED = _layer("fitted on 68 cases of studies/concealed (seeds 201 and 4711, pe
                 gain_of_attachment=0.081, gain_of_channel=0.0, gain_of_incoherent=0.451, gain_of_pair=0.550, gain_of_other=0.068,
                 visible=1.994, visible_second=0.419, strength=0.643, regret=0.843, small_regret=0.080, second=0.003, second_share=0.0,
                 second_of_rest=0.868, gain_of_best=-0.112, visible_of_best=-0.094, unexplained=0.569, held=1.062, linear_leftover=0.0,
-                attachment=-0.997, input_or_channel=1.596, incoherent=-0.515, pair_with_attachment=-2.819, pair_with_incoherent=0.262)
+                attachment=-0.997, input_or_channel=1.596, incoherent=-0.515, pair_with_attachment=-2.819, pair_with_incoherent=0.262,
+                faint=-2.0)
 SHIPPED = FITTED

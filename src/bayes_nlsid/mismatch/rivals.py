@@ -53,6 +53,8 @@ class Rival:
         Leftover −2 log likelihood beyond its expectation.
     held : float
         Logarithm of the squared error on the records kept aside over that of noise; NaN if they were not run.
+    faint : bool
+        Not estimated, for nothing speaks for it: ``gain`` is what one regression promises.
     """
 
     key: Key
@@ -65,6 +67,7 @@ class Rival:
     visible: float = float("nan")
     rest: float = 0.0
     held: float = float("nan")
+    faint: bool = False
 
     @property
     def strength(self) -> float:
@@ -95,8 +98,20 @@ def all_rivals(case: Case, bench: Bench, fit: LinearFit, found: Found, noise: Ar
         rivals.append(replace(one, alone=max(alone, 0.0)))
     rivals += _clipping(case, bench, fit, found.none, list(bench.family.places), rivals, noise, say)
     rivals = _disturbed(disturbances, rivals, case)
+    rivals += _faint(found, {r.key for r in rivals}, float(np.log(max(bench.evidence.H.size, 2))))
     simple: dict[Key, Rival] = {r.key: r for r in rivals if len(r.key) == 1}
     return sorted((_seen(r, simple, bench.evidence, fit) for r in rivals), key=lambda r: -r.gain)
+
+
+def _faint(found: Found, known: set[Key], charge: float) -> list[Rival]:
+    """The best place of every linear class of which no effect was worth estimating, by what one regression promises: what may be there,
+    too weak to be seen."""
+    out: dict[str, Rival] = {}
+    for c in found.first:
+        cls = c.effect.cls
+        if not c.effect.is_force and c.effect.kind != "maxwell" and cls not in out and all(cls != k for key in known for k, _ in key):
+            out[cls] = Rival((c.effect.key,), c.gain - charge, faint=True)
+    return list(out.values())
 
 
 def _seen(r: Rival, simple: dict[Key, Rival], evidence: Evidence, fit: LinearFit) -> Rival:
