@@ -11,10 +11,11 @@ from scipy.linalg import eigh
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.forces.term import Term
-from bayes_nlsid.mismatch.calibrate import PSEUDO, assemble, calibrate, finish, floored
+from bayes_nlsid.mismatch.calibrate import assemble, calibrate, finish, floored
 from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, catalogue_rows
 from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.evidence import gather
+from bayes_nlsid.mismatch.form import PSEUDO
 from bayes_nlsid.mismatch.krylov import gmres
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve

@@ -2,9 +2,8 @@
 
 Poles of the measurement (vector fitting, started at the nominal poles) are paired with nominal modes by MAC, which brings the
 physical parameters into the right basin; then the transfer function itself is fitted, first coarsely, at last against its noise. Errors
-of single mode shapes at single sensors are random effects and are integrated out sensor by sensor; how large they are, mode by mode, is
-estimated by the marginal likelihood (EM: Dempster, Laird and Rubin 1977), so that the form of a good model is trusted and that of a bad
-one is not, and differences of cost between hypotheses mean what they say.
+of single mode shapes at single sensors are random effects and are integrated out sensor by sensor; how large these and other errors of
+the model's form are is estimated with them (``form``).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from bayes_nlsid.mismatch.form import groups_price, likeliest_groups, likeliest_shapes, shapes_price
 from bayes_nlsid.mismatch.linear import Attachment, Family, Fields, fields, jacobian, solve
 from bayes_nlsid.mismatch.poles import modal_start
 from bayes_nlsid.mismatch.shapes import shape_columns, with_shape_errors
@@ -23,7 +23,6 @@ from bayes_nlsid.mismatch.shapes import shape_columns, with_shape_errors
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RELATIVE_FLOOR = 2e-4  # of any model of this kind
-PSEUDO = 3.0  # sensors that the usual size of shape errors counts for
 
 
 @final
@@ -99,6 +98,8 @@ class LinearFit:
         Those of modes in the band, and of groups beyond it.
     spread : ndarray (m,)
         Their standard deviations, fitted.
+    sd : ndarray (P,)
+        Prior standard deviations of theta, those of errors of form fitted.
     s, measured, variance : lines, measured accelerance (L, S), its variance
     system : System
         The normal equations at the optimum.
@@ -119,6 +120,7 @@ class LinearFit:
     normal: Array
     shape_errors: Array
     spread: Array
+    sd: Array
     s: Complex
     measured: Complex
     variance: Array
@@ -213,7 +215,7 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
     C = gram + np.eye(Br.shape[1]) / spread ** 2
     Brr = np.einsum("smk,sk->sm", Br, r)
     effect = np.linalg.solve(C, Brr[..., None])[..., 0]
-    chi2 = float((r ** 2).sum() - (Brr * effect).sum()) + _price(gram, C, spread, fam.error_sd)
+    chi2 = float((r ** 2).sum() - (Brr * effect).sum()) + shapes_price(gram, C, spread, fam.error_sd)
     if not derivatives:
         return System(np.zeros((0, 0)), np.zeros(0), chi2, root, Br, Jr, C, r)
     BJ = Br @ np.swapaxes(Jr, 1, 2)
@@ -222,26 +224,6 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
     normal = flat @ flat.T - np.einsum("smp,smq->pq", BJ, CBJ, optimize=True)
     gradient = np.einsum("spk,sk->p", Jr, r) - np.einsum("smp,sm->p", CBJ, Brr)
     return System(normal, gradient, chi2, root, Br, Jr, C, r)
-
-
-def _price(gram: Array, C: Array, spread: Array, usual: Array) -> float:
-    """What errors of shapes larger or smaller than usual cost: ratio of determinants and an inverse-gamma prior on each variance."""
-    if np.array_equal(spread, usual):
-        return 0.0
-    ratio = (usual / spread) ** 2
-    before = np.linalg.slogdet(gram + np.eye(len(usual)) / usual ** 2)[1].sum() + 2 * len(gram) * np.log(usual).sum()
-    after = np.linalg.slogdet(C)[1].sum() + 2 * len(gram) * np.log(spread).sum()
-    return float(after - before + PSEUDO * (ratio - np.log(ratio) - 1).sum())
-
-
-def spread_of(system: System, spread: Array, usual: Array, rounds: int = 8) -> Array:
-    """Likeliest sd of shape errors mode by mode (EM), the rest of the model held."""
-    gram, right = system.B @ np.swapaxes(system.B, 1, 2), np.einsum("smk,sk->sm", system.B, system.r)
-    for _ in range(rounds):
-        inverse = np.linalg.inv(gram + np.eye(len(usual)) / spread ** 2)
-        squares = (inverse @ right[..., None])[..., 0] ** 2 + np.einsum("smm->sm", inverse)
-        spread = np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram)))
-    return np.asarray(spread)
 
 
 def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, steps: int, *, prior_sd: Array | None = None,
@@ -284,29 +266,35 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
 def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, extension: Extension | None = None,
            x: Array | None = None, prior_sd: Array | None = None, status: str = "ok", spread: Array | None = None,
            rounds: int = 6) -> LinearFit:
-    """Curvature, random effects and best prediction at ``theta``, ``x``; in ``rounds`` the size of shape errors is fitted too."""
+    """Curvature, random effects and best prediction at ``theta``, ``x``; in ``rounds`` the sizes of errors of form are fitted too."""
     x = np.zeros(0) if x is None else x
     spread = fam.error_sd if spread is None else spread
+    sd = fam.prior_sd if prior_sd is None else prior_sd
+    beside = np.zeros(0) if extension is None else 1 / extension.prior_sd ** 2
+    pull = np.zeros(0) if extension is None else beside * (x - extension.centre)
+    own = np.diag(np.concatenate([np.zeros(fam.size), beside]))
     system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
     before = np.inf
     for _ in range(rounds):
-        spread = spread_of(system, spread, fam.error_sd)
-        theta, x, cost = descend(fam, theta, s, measured, variance, 2, prior_sd=prior_sd, extension=extension, x=x, tol=0.1, spread=spread)
+        spread = likeliest_shapes(system.B @ np.swapaxes(system.B, 1, 2), np.einsum("smk,sk->sm", system.B, system.r), spread, fam.error_sd)
+        sd = likeliest_groups(fam, theta, system.normal + own, system.gradient - np.concatenate([0 * theta, pull]), sd)
+        theta, x, cost = descend(fam, theta, s, measured, variance, 2, prior_sd=sd, extension=extension, x=x, tol=0.1, spread=spread)
         system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
+        pull = np.zeros(0) if extension is None else beside * (x - extension.centre)
+        cost += groups_price(fam, system.normal + own, sd)
         if before - cost < 1.0:
             break
         before = cost
     fld, chain = predict(fam, theta, s, extension, x)
-    prior = 1 / (fam.prior_sd if prior_sd is None else prior_sd) ** 2
-    cost = system.chi2 + float(prior @ theta ** 2) + (extension.penalty(x) if extension is not None else 0.0)
+    cost = system.chi2 + float(((theta / sd) ** 2).sum()) + (extension.penalty(x) if extension is not None else 0.0)
+    cost += groups_price(fam, system.normal + own, sd)
     errors = system.effects
     model = with_shape_errors(fam, fld, s, errors)
     model = model if chain is None else chain.apply(model)
     misfit = float(np.sqrt((np.abs(measured - model) ** 2 / variance).sum() / (np.abs(measured) ** 2 / variance).sum()))
-    rest = system.gradient - np.concatenate([prior * theta, (x - extension.centre) / extension.prior_sd ** 2] if extension is not None
-                                            else [prior * theta])
-    full = system.normal + np.diag(np.concatenate([prior, 1 / extension.prior_sd ** 2]) if extension is not None else prior)
-    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, spread, s, measured, variance,
+    rest = system.gradient - np.concatenate([theta / sd ** 2, pull])
+    full = system.normal + np.diag(np.concatenate([1 / sd ** 2, beside]))
+    return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, spread, sd, s, measured, variance,
                      system, rest, misfit, status)
 
 

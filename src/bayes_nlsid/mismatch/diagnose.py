@@ -92,6 +92,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
     say("searching laws, places and channels")
     places = list(fam.places)
     found = search(bench, fit, places, case.band, say, () if linear else _one_level(fam, evidence))
+    fit = found.fit
     noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes)
     rivals = all_rivals(case, bench, fit, found, floor, noisy, say)
     say("running the leading explanations on records that were not used")

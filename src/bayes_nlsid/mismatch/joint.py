@@ -67,7 +67,7 @@ class Joint:
         evidence = bench.evidence
         self.s = evidence.spectra.s[evidence.excited]
         self.variance = floored(evidence.H, evidence.doubted(h.residual) if doubt else evidence.variance)
-        self.sd = widened(bench.family, {e.place for e in h.effects if e.is_force or e.cls == "linear_stiffness"})
+        self.sd = widened(bench.family, h.fit.sd, {e.place for e in h.effects if e.is_force or e.cls == "linear_stiffness"})
 
     def effects(self, y: Array) -> tuple[Effect, ...]:
         """The force effects at ``y``."""

@@ -84,12 +84,12 @@ class Family:
     mixing: Array
     dashpots: Array
     dashpot: Array
-    mode_sd: float = 0.003
+    mode_sd: float = 0.001
     damping_sd: float = 0.25
-    drive_sd: float = 0.003
-    dashpot_sd: float = 0.2
-    mixing_sd: float = 0.003
-    shape_sd: float = 0.003
+    drive_sd: float = 0.001
+    dashpot_sd: float = 0.05
+    mixing_sd: float = 0.001
+    shape_sd: float = 0.0015
     beyond_sd: float = 0.01
 
     @property

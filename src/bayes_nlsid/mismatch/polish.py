@@ -145,12 +145,12 @@ def everywhere(bench: Bench, h: Hypothesis, places: list[str]) -> tuple[Bed, lis
     return paths, out
 
 
-def widened(fam: Family, places: set[str]) -> Array:
-    """Prior with the stiffness of some places released."""
-    sd = fam.prior_sd.copy()
+def widened(fam: Family, sd: Array, places: set[str]) -> Array:
+    """Prior ``sd`` (P,) with the stiffness of these places released, and of no others."""
+    sd = np.concatenate([fam.scale_sd, sd[len(fam.names):]])
     for i, name in enumerate(fam.names[:len(fam.K_parts)]):
         if name in places:
-            sd[i] *= WIDENING
+            sd[i] = WIDENING * fam.prior_sd[i]
     return sd
 
 
@@ -170,7 +170,7 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     Parameters
     ----------
     start : linear fit to begin from.
-    candidates : effects with starting values from the first search.
+    candidates : effects with starting values from the first search; none for the linear model alone.
     """
     fam, evidence = bench.family, bench.evidence
     effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
@@ -178,9 +178,9 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     begin = [(start.theta, x)]
     if ext is not None and strained(fam, start.theta, sd):
         begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
-    ends = [descend(fam, t, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03) for t, y in begin]
+    ends = [descend(fam, t, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03, spread=start.spread) for t, y in begin]
     theta, x, _ = min(ends, key=lambda e: e[2])
-    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd)
+    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=start.spread)
     return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
 
 
@@ -190,7 +190,7 @@ def _prepared(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]
     effects = tuple(c.effect for c in candidates)
     kinds = tuple(kind_of(bench, c) for c in candidates if not c.effect.is_force and c.effect.cls != "linear_stiffness")
     ext = extension(kinds, len(bench.channels))
-    sd = widened(bench.family, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
+    sd = widened(bench.family, start.sd, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
     x = np.zeros(0) if ext is None else ext.x
     if ext is not None and len(start.x) and len(start.x) <= len(x):
         x = np.concatenate([start.x, x[len(start.x):]])

@@ -13,7 +13,7 @@ from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
-from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, everywhere
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, estimate_linear, everywhere
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -31,6 +31,8 @@ class Found:
     ----------
     none : float
         −2 log likelihood with nothing but the calibrated linear model.
+    fit : LinearFit
+        That model.
     singles, doubles : tuple of Hypothesis
         Estimated, best first.
     latents : tuple of Latent
@@ -39,6 +41,7 @@ class Found:
     """
 
     none: float
+    fit: LinearFit
     singles: tuple[Hypothesis, ...]
     doubles: tuple[Hypothesis, ...]
     latents: tuple[Latent, ...]
@@ -66,7 +69,9 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     if linear_too:
         columns = _short_linear(linear)
         say(f"estimating {len(columns)} linear effects")
-        singles = _better(singles, [estimate(bench, fit, (c,)) for c in columns])
+        fit, estimates = _estimated(bench, fit, columns)
+        none = bench.evidence.chi2 + fit.cost
+        singles = _better(singles, estimates)
     asked = linear_too and top_linear > 40
     if asked and (not singles or singles[0].fit.cost + singles[0].misfit_records > 1.02 * (fit.dof + bench.evidence.values) or
                   singles[0].fit.cost > 1.02 * fit.dof):
@@ -94,7 +99,20 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
             say("a member of a pair leads alone: looking for a second effect beside it")
             singles = _finish_leaders(bench, singles, none, finished)
             doubles = _better(doubles, _second(bench, singles[0], places, band))
-    return Found(none, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
+    return Found(none, fit, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
+
+
+def _estimated(bench: Bench, fit: LinearFit, columns: list[Candidate]) -> tuple[LinearFit, list[Hypothesis]]:
+    """Linear effects estimated, and the linear model alone calibrated again from where the best of them have left it: an effect that
+    only leads it out of a side valley explains nothing."""
+    found: list[Hypothesis] = []
+    for _ in range(3):
+        found = _better(found, [estimate(bench, fit, (c,)) for c in columns])
+        again = min((estimate_linear(bench, h.fit, ()).fit for h in found[:2]), key=lambda f: f.cost, default=fit)
+        if not again.cost < fit.cost - 3.0:
+            break
+        fit = again
+    return fit, found
 
 
 def _pooled(bench: Bench, fits: tuple[LinearFit, ...], places: list[str]
@@ -318,7 +336,7 @@ def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis], gained: 
     rival began badly."""
     out: dict[tuple[str, str], Hypothesis] = {}
     for pair in sorted(doubles, key=lambda h: h.cost)[:2]:
-        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof, 0.1 * gained):
+        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof if pair.forces else 0.0, 0.1 * gained):
             break
         for candidate in _lead(pair):
             key = candidate.effect.key
