@@ -80,7 +80,7 @@ _PLAIN: tuple[Callable[..., Any], ...] = (laws.spring, laws.dashpot, laws.jenkin
 _OF_JOINTS: tuple[Callable[..., Any], ...] = (
     joint_laws.power_spring, joint_laws.falling_spring, joint_laws.levelling, joint_laws.saturating, joint_laws.rounded_gap,
     joint_laws.one_stop, joint_laws.two_stops, joint_laws.one_sided, joint_laws.bent, joint_laws.closing, joint_laws.rounded_friction,
-    joint_laws.falling_friction, joint_laws.power_damper, joint_laws.exponential_spring)
+    joint_laws.falling_friction, joint_laws.power_damper, joint_laws.exponential_spring, joint_laws.round_stops)
 for _part in (joint_laws.soft, joint_laws.step):
     numba.extending.register_jitable(_part)
 for _module, _group in ((laws, (*_FAMILIES, *_PLAIN)), (joint_laws, _OF_JOINTS)):
@@ -150,8 +150,11 @@ def _joint_law_value(code: int, q: float, v: float, p: NDArray[np.float64]) -> t
     if code == 12:
         slope = joint_laws.power_damper_slope(q, v, p[0], p[1], p[2])
         return joint_laws.power_damper(q, v, p[0], p[1], p[2]), slope[0], slope[1]
-    slope = joint_laws.exponential_spring_slope(q, v, p[0], p[1])
-    return joint_laws.exponential_spring(q, v, p[0], p[1]), slope[0], slope[1]
+    if code == 13:
+        slope = joint_laws.exponential_spring_slope(q, v, p[0], p[1])
+        return joint_laws.exponential_spring(q, v, p[0], p[1]), slope[0], slope[1]
+    slope = joint_laws.round_stops_slope(q, v, p[0], p[1], p[2])
+    return joint_laws.round_stops(q, v, p[0], p[1], p[2]), slope[0], slope[1]
 
 
 @compiled

@@ -95,6 +95,17 @@ def one_stop_slope(q: Value, v: Value, k: Value, e: Value, n: Value) -> Value:
     return np.abs(k) * n * where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0), 0.0
 
 
+def round_stops(q: Value, v: Value, k: Value, e: Value, n: Value) -> Value:
+    """k e sgn(q) max(|q|/e − 1, 0)^n."""
+    return k * e * np.sign(q) * np.maximum(np.abs(q) / e - 1.0, 0.0) ** n
+
+
+def round_stops_slope(q: Value, v: Value, k: Value, e: Value, n: Value) -> Value:
+    """k n max(|q|/e − 1, 0)^(n−1)."""
+    y = np.abs(q) / e - 1.0
+    return k * n * where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0), 0.0
+
+
 def two_stops(q: Value, v: Value, k: Value, e: Value, r: Value, u: Value) -> Value:
     """k beyond e, r k beyond −u e."""
     return k * (np.maximum(q - e, 0.0) - r * np.maximum(-q - u * e, 0.0))

@@ -130,7 +130,7 @@ def _onset(analysis: Analysis, best: Rival) -> tuple[float, str]:
     v = e.values
     if name == "clearance":
         return float(v[1]) / 2, unit
-    if name in ("rounded_gap", "one_stop", "two_stops"):
+    if name in ("rounded_gap", "one_stop", "two_stops", "round_stops"):
         return float(v[1]), unit
     if name in ("one_sided_spring", "bent_spring"):
         return abs(float(v[1] * v[-1])), unit

@@ -119,6 +119,11 @@ TWO_STOPS = Term("two_stops", "k*(max(q - e, 0) - r*max(-q - u*e, 0))",
                   Param("u", "", "range", 0.2, 5.0, "gap on the other side over this one")),
                  joint_laws.two_stops, joint_laws.two_stops_slope, parity="none", meaning="unequal stops on both sides")
 
+ROUND_STOPS = Term("round_stops", "k*e*sign(q)*max(abs(q)/e - 1, 0)**n",
+                   (Param("k", "N/m", "stiffness", meaning="stiffness scale"), Param("e", "m", "displacement", meaning="gap"),
+                    Param("n", "", "range", 1.0, 2.5, "exponent, 1.5 for round bodies")),
+                   joint_laws.round_stops, joint_laws.round_stops_slope, meaning="gap between round bodies on both sides")
+
 ONE_SIDED = Term("one_sided_spring", "k*where(q > e*d, q - e*d, 0)",
                  (Param("k", "N/m", "coefficient", meaning="stiffness on one side"),
                   Param("e", "", "range", -3.0, 3.0, "where it begins, over d"),
@@ -187,6 +192,7 @@ SOFTENING = (Law(SATURATING, lambda z: _grid(np.array([1.0]), z.displacement * n
 _GAPS = np.array([0.5, 1.2, 2.0, 3.0, 4.0, 5.0, 6.0])
 CLEARANCE = (Law(LIBRARY["clearance"], lambda z: _grid(np.array([1.0]), z.displacement * _GAPS), ("log", "log"), (0,)),
              Law(ROUNDED_GAP, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:5], np.array([0.1])), ("log", "log", "log"), (0,)),
+             Law(ROUND_STOPS, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:5], np.array([1.5])), ("log", "log", "log"), (0,)),
              Law(TWO_STOPS, lambda z: _grid(np.array([1.0]), z.displacement * _GAPS[:4], np.array([0.3, 1.0]), np.array([0.6, 1.6])),
                  ("log", "log", "log", "log"), (0,)))
 ASYMMETRIC = (Law(ONE_SIDED, lambda z: _grid(np.array([1.0]), np.array([-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0]), np.array([z.displacement])),

@@ -222,7 +222,7 @@ def onset_of(suspect: Suspect, p: Array) -> float:
         return float(p[1]) / 2
     if name == "one_sided_spring":
         return abs(float(p[1])) * float(p[2])
-    if name in ("rounded_gap", "one_stop", "two_stops"):
+    if name in ("rounded_gap", "one_stop", "two_stops", "round_stops"):
         return float(p[1])
     if name == "saturating_spring":
         return 0.1 * float(p[1])

@@ -27,7 +27,8 @@ BOUC_WEN = Law(LIBRARY["bouc_wen"], lambda z: np.array([[1.0, b / z.displacement
                                                         for d in (-1.6, -1.2, -0.5, 0.5)]),
                ("log", "log", "fixed", "linear", "fixed"), (0,), excess=True)
 # Largest gap over the largest motion, and largest rounding of its faces: beyond them the law is a smooth hardening spring.
-GAPS = {("clearance", "d"): 1.8, ("rounded_gap", "e"): 0.9, ("rounded_gap", "w"): 0.2, ("one_stop", "e"): 0.9, ("two_stops", "e"): 0.9}
+GAPS = {("clearance", "d"): 1.8, ("rounded_gap", "e"): 0.9, ("rounded_gap", "w"): 0.2, ("one_stop", "e"): 0.9, ("two_stops", "e"): 0.9,
+        ("round_stops", "e"): 0.9}
 FORCES = ("hardening", "softening", "clearance", "asymmetric", "coulomb", "quad_damping", "hysteresis")
 
 
