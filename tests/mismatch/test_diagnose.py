@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,31 @@ def test_one_of_each_kind_is_named(tmp_path: Path, cls: str, place: str, strengt
     if cls != "clipping":
         assert np.linalg.norm(sealed - truth["sealed_ms"]) < 0.1 * np.linalg.norm(truth["sealed_ms"])
     assert found.heldout["nrmse_extended"] <= 1.02 * found.heldout["nrmse_updated_linear"]
+    shows_its_effect(found.figures, best.effects[0][0])
+
+
+def shows_its_effect(f: Mapping[str, np.ndarray], cls: str) -> None:
+    """The numbers behind the figures of one class."""
+    if "law_0_curve" in f and cls == f["law_0_class"]:
+        own = f["law_0_velocity" if f["law_0_phase"] == "velocity" else "law_0_displacement"]
+        at = np.interp(own, f["law_0_grid"], f["law_0_curve"])
+        assert np.abs(at - f["law_0_force"]).max() < 0.05 * np.abs(f["law_0_force"]).max()   # along the motion it is the curve
+    if "law_0_left" in f:
+        assert f["law_0_left"].std() < 0.7 * f["law_0_force"].std()
+        assert f["record_after"].max() < f["record_before"].max()
+    if cls == "sensor_delay":
+        left, with_it = (np.abs(np.angle(f["chain_0_ratio"] / e)) / f["chain_0_sd"] for e in (1.0, f["chain_0_effect"]))
+        assert np.median(left) > 3 * np.median(with_it) and np.median(with_it) < 2
+    if cls == "added_mass":
+        before, after = (np.abs(f["frf_measured"] - f[k]) / f["frf_error"] for k in ("frf_linear", "frf_extended"))
+        assert (after ** 2).sum() < 0.7 * (before ** 2).sum()
+    if cls == "stiffness_drift":
+        assert np.ptp(f["drift_value"]) > 3 * f["drift_error"].max()
+    if cls == "clipping":
+        assert np.abs(f["clip_model"]).max() > f["clip_level"] and np.abs(f["clip_measured"]).max() < 1.1 * f["clip_level"]
+    if cls == "mains_hum":
+        at = [int(np.argmin(np.abs(f["quiet_frequency"] - h * f["quiet_mains"]))) for h in (1, 2, 3)]
+        assert f["quiet_own"][at].max() > 3 * np.median(f["quiet_own"])
 
 
 def test_bursts_only_with_four_sensors_runs(tmp_path: Path) -> None:

@@ -13,8 +13,10 @@ from bayes_nlsid.mismatch.case import Case, CaseRecord
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.diagnose import Analysis, Progress, Proof, Rival, claim, intervals, prove, rank
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
+from bayes_nlsid.mismatch.portrait import portrait
 from bayes_nlsid.mismatch.probability import Key, Layer
 from bayes_nlsid.mismatch.prove import Predictor, envelope
+from bayes_nlsid.mismatch.words import PHASES, error_percent, power_onset, separates, size_of, sure, whole_percent
 
 Array = NDArray[np.float64]
 
@@ -46,10 +48,12 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
                "nrmse_extended": proof.extended, "noise_floor": proof.noise, "elpd_difference": proof.elpd, "elpd_se": proof.elpd_se,
                "coverage90": proof.coverage, "withdrawn": proof.withdrawn}
     predictions = _predict_sealed(analysis, predictor, proof)
-    sentence = _sentence(verdict, p_mismatch, hypotheses, where, proof)
+    sentence = _sentence(verdict, p_mismatch, hypotheses, where, proof, () if best is None else best.key)
     detection = {"linear_statistic": analysis.evidence.statistic, "odd_lines": analysis.evidence.odd, "even_lines": analysis.evidence.even,
                  "linear_misfit_per_value": analysis.fit.cost / analysis.fit.dof}
-    figures = _figures(analysis, proof, odds)
+    figures = portrait(analysis, best, proof, predictor) | {
+        "hypothesis_names": np.array([" + ".join(f"{c}@{p}" for c, p in k) or "none" for k in odds]),
+        "hypothesis_probability": np.array(list(odds.values()))}
     return Diagnosis(analysis.case.name, seed, clock.perf_counter() - begun, verdict, p_mismatch, where, hypotheses, heldout, sentence,
                      detection, tuple(notes), predictions, figures, asdict(analysis.scores))
 
@@ -79,7 +83,7 @@ def _named(analysis: Analysis, odds: dict[Key, float], seed: int) -> tuple[Named
                 parameters += ({"name": f"{e.cls}[{e.place}].{e.names[0]}", "unit": e.units[0], "q05": 0.9 * value, "q50": value,
                                 "q95": 1.1 * value},)
         words = " and ".join(claim(e) for e in effects)
-        out.append(Named(effects, p, parameters, words, _separates(effects, ordered)))
+        out.append(Named(effects, p, parameters, words, separates(effects, ordered)))
     if rest > 0:
         out = [Named(h.effects, h.probability + (rest if h.effects == (("other", "-"),) else 0.0), h.parameters, h.sentence, h.separated_by)
                for h in out]
@@ -88,26 +92,14 @@ def _named(analysis: Analysis, odds: dict[Key, float], seed: int) -> tuple[Named
     return tuple(sorted(out, key=lambda h: -h.probability))
 
 
-def _separates(effects: Key, ordered: list[tuple[Key, float]]) -> str:
-    """The test of the first row that would tell this from the next one."""
-    cls = effects[0][0]
-    rivals = [key for key, _ in ordered if key and key != effects][:3]
-    for key in rivals:
-        for other, _ in key:
-            if cls in ROWS and other in ROWS[cls].confused:
-                return ROWS[cls].test
-    return ROWS[cls].test if cls in ROWS else ""
-
-
 def _where(analysis: Analysis, odds: dict[Key, float], best: Rival | None) -> dict[str, Any]:
     table: dict[str, float] = {}
     for key, p in odds.items():
         for _, place in key:
             table[place] = table.get(place, 0.0) + p
     ranked = sorted(((n, p) for n, p in table.items() if n != "-"), key=lambda kv: -kv[1])[:8]
-    alike = [n for n, p in ranked if ranked and p > 0.25 * ranked[0][1]]
-    locations = [{"name": n, "probability": min(p, 1.0), "indistinguishable_from": [m for m in alike if m != n] if n in alike else []}
-                 for n, p in ranked]
+    alike = _alike(odds, [n for n, p in ranked if p > 0.25 * ranked[0][1]])
+    locations = [{"name": n, "probability": min(p, 1.0), "indistinguishable_from": alike.get(n, [])} for n, p in ranked]
     spectra = analysis.evidence.spectra
     phase, time, onset, unit = "-", "throughout", 0.0, "m"
     if best is not None:
@@ -116,6 +108,24 @@ def _where(analysis: Analysis, odds: dict[Key, float], best: Rival | None) -> di
         onset, unit = _onset(analysis, best)
     return {"locations": locations, "amplitude": {"onset": onset, "unit": unit}, "band_hz": _band(analysis, best), "time": time,
             "phase": phase, "records": list(spectra.names)}
+
+
+def _alike(odds: dict[Key, float], names: list[str]) -> dict[str, list[str]]:
+    """Places that stand for one another: the same class sits at one or the other, but not at both at once."""
+    classes: dict[str, set[str]] = {}
+    together: dict[tuple[str, str], float] = {}
+    single: dict[str, float] = {}
+    for key, p in odds.items():
+        places = {place for _, place in key}
+        for cls, place in key:
+            if p > 0.01:
+                classes.setdefault(place, set()).add(cls)
+        for n in places:
+            single[n] = single.get(n, 0.0) + p
+            for m in places - {n}:
+                together[n, m] = together.get((n, m), 0.0) + p
+    return {n: [m for m in names if m != n and classes.get(n, set()) & classes.get(m, set())
+                and together.get((n, m), 0.0) < 0.5 * min(single[n], single[m])] for n in names}
 
 
 def _onset(analysis: Analysis, best: Rival) -> tuple[float, str]:
@@ -140,18 +150,22 @@ def _onset(analysis: Analysis, best: Rival) -> tuple[float, str]:
         return (0.1 if name.startswith("iwan") else 1.0) * float(v[0] / max(v[1], 1e-300)), unit
     latent = next((x for x in analysis.found.latents if x.place == e.place), None)
     if name == "power_spring" and latent is not None:
-        return 0.5 * float(latent.displacement.std(1).max()), unit
+        return power_onset(float(np.abs(latent.displacement).max()), float(v[2])), unit
     return 0.0, unit
 
 
 def _band(analysis: Analysis, best: Rival | None) -> list[float]:
-    """Frequencies that hold 80 % of the squared residual over noise that the best hypothesis explains."""
+    """Frequencies that hold 80 % of what the best hypothesis explains, in records and transfer function together."""
     evidence = analysis.evidence
-    power = np.einsum("ls,rls->l", evidence.weight, np.abs(evidence.residual) ** 2) - len(evidence.residual) * evidence.weight.shape[1]
     if best is None or best.hypothesis is None:
         return [float(analysis.case.band[0]), float(analysis.case.band[1])]
-    after = np.einsum("ls,rls->l", evidence.weight, np.abs(best.hypothesis.residual) ** 2)
-    power = np.maximum(power + len(evidence.residual) * evidence.weight.shape[1] - after, 0)
+    before, after = (np.einsum("r,ls,rls->l", evidence.trust, evidence.weight, np.abs(residual) ** 2)
+                     for residual in (evidence.residual, best.hypothesis.residual))
+    power = before - after
+    # faults of mass, stiffness and channels show in the transfer function
+    first, then = ((np.abs(fit.measured - fit.model) ** 2 / fit.variance).sum(1) for fit in (analysis.fit, best.hypothesis.fit))
+    power[evidence.excited] += first - then
+    power = np.maximum(power, 0)
     if power.sum() <= 0:
         return [float(analysis.case.band[0]), float(analysis.case.band[1])]
     share = np.cumsum(power) / power.sum()
@@ -188,60 +202,37 @@ def _all_channels(case: Case, record: CaseRecord, wave: Array) -> Array:
     return out
 
 
-def _sentence(verdict: str, p: float, hypotheses: tuple[Named, ...], where: dict[str, Any], proof: Proof) -> str:
-    sure = "> 0.999" if p > 0.999 else f"= {p:.3f}"
+def _sentence(verdict: str, p: float, hypotheses: tuple[Named, ...], where: dict[str, Any], proof: Proof, shown: Key) -> str:
+    """The first line of the answer; ``shown``: the hypothesis that place, onset and proof belong to."""
     if verdict == "none":
-        return (f"The recordings do not differ from the model beyond noise and its tolerances (p of a mismatch {sure}). "
-                f"The calibrated model predicts {', '.join(proof.records)} with an error of {100 * proof.updated:.2g} % "
-                f"(noise floor {100 * proof.noise:.2g} %).")
+        return (f"The recordings do not differ from the model beyond noise and its tolerances (p of a mismatch {sure(p)}). "
+                f"The calibrated model predicts {', '.join(proof.records)} with an error of {error_percent(proof.updated)} "
+                f"(noise floor {error_percent(proof.noise)}).")
     real = [h for h in hypotheses if h.effects != (("none", "-"),)]
     first = real[0]
     places = " and ".join("a place these data do not show" if q == "-" else q for q in dict.fromkeys(q for _, q in first.effects))
-    text = (f"The recordings differ from the model beyond noise (p {sure})." if p > 0.65 else
-            f"Whether the recordings differ from the model beyond noise and its tolerances cannot be told from these data (p {sure}).")
+    text = (f"The recordings differ from the model beyond noise (p {sure(p)})." if p > 0.65 else
+            f"Whether the recordings differ from the model beyond noise and its tolerances cannot be told from these data (p {sure(p)}).")
     text += f" The mismatch {'sits' if p > 0.65 else 'would sit'} at {places}"
-    onset = where["amplitude"]["onset"]
+    onset = where["amplitude"]["onset"] if first.effects == shown else 0.0
     if onset > 0:
-        text += f"; it grows with amplitude from about {onset:.2g} {where['amplitude']['unit']}"
-    if where["phase"] not in ("-", ""):
-        text += f"; it follows the {where['phase']}" if where["phase"] in ("displacement", "velocity", "acceleration") else (
-            "; it follows the history of displacement (loops)" if where["phase"] == "memory" else f"; it sits in the {where['phase']}")
-    text += f". Missing physics: {first.sentence} ({100 * first.probability:.0f} %)"
+        text += f"; it grows with amplitude from about {size_of(onset, where['amplitude']['unit'])}"
+    if where["phase"] in PHASES and first.effects == shown:
+        text += f"; {PHASES[where['phase']]}"
+    text += f". Missing physics: {first.sentence} ({whole_percent(first.probability)})"
     if len(real) > 1 and real[1].probability > 0.005:
-        text += f"; next, {real[1].sentence} ({100 * real[1].probability:.0f} %), which this would separate: {first.separated_by}"
+        text += f"; next, {real[1].sentence} ({whole_percent(real[1].probability)})"
     text += "."
     if proof.withdrawn:
         text += " Added to the model it does not improve the records that were not used, so no improvement is claimed."
+    elif first.effects != shown or proof.extended > 0.98 * proof.updated:
+        text += (f" On {', '.join(proof.records)} (not used) the error is {error_percent(proof.nominal)} as delivered and "
+                 f"{error_percent(proof.updated)} with the best linear re-tuning (noise floor {error_percent(proof.noise)})"
+                 + (", and no less with it." if first.effects == shown else "; nothing can be added to the model that it names."))
     else:
-        text += (f" With it, the error on {', '.join(proof.records)} (not used) falls from {100 * proof.nominal:.2g} % to "
-                 f"{100 * proof.extended:.2g} % (noise floor {100 * proof.noise:.2g} %); the best linear re-tuning reaches "
-                 f"{100 * proof.updated:.2g} %.")
+        text += (f" With it, the error on {', '.join(proof.records)} (not used) falls from {error_percent(proof.nominal)} to "
+                 f"{error_percent(proof.extended)} (noise floor {error_percent(proof.noise)}); the best linear re-tuning reaches "
+                 f"{error_percent(proof.updated)}.")
     if verdict == "cannot_tell":
         text += " These data cannot tell the leading explanations apart."
     return text
-
-
-def _figures(analysis: Analysis, proof: Proof, odds: dict[Key, float]) -> dict[str, NDArray[Any]]:
-    """Numbers for figures: where, latent force against motion, transfer functions, before and after."""
-    evidence, fit = analysis.evidence, analysis.fit
-    e = evidence.excited
-    latents = sorted(analysis.found.latents, key=lambda x: -x.explained)
-    out: dict[str, NDArray[Any]] = {
-        "frequency": evidence.spectra.frequency, "frf_frequency": evidence.spectra.frequency[e], "frf_measured": evidence.H,
-        "frf_linear": fit.model, "residual_by_line": np.sqrt((np.abs(evidence.residual) ** 2).mean((0, 2))),
-        "noise_by_line": np.sqrt(evidence.spectra.noise.mean((0, 2))), "statistic_by_record": evidence.by_record,
-        "levels": evidence.spectra.levels, "starts": evidence.spectra.starts,
-        "place_names": np.array([x.place for x in latents]), "place_share": np.array([x.share for x in latents]),
-        "hypothesis_names": np.array([" + ".join(f"{c}@{p}" for c, p in k) or "none" for k in odds]),
-        "hypothesis_probability": np.array(list(odds.values()))}
-    strongest = int(np.argmax(evidence.spectra.levels))
-    for i, x in enumerate(latents[:3]):
-        out[f"latent_{i}_force"], out[f"latent_{i}_displacement"] = x.force[strongest], x.displacement[strongest]
-        out[f"latent_{i}_velocity"] = x.velocity[strongest]
-    limit = 4096
-    for name, wave in proof.waves.items():
-        out[f"heldout_{name}"] = wave[:limit].astype(np.float32)
-        out[f"heldout_{name}_envelope"] = envelope(wave, analysis.case.rate)[::64]
-    out["heldout_channels"] = np.array([n for n, ok in zip(analysis.case.sensors, analysis.case.usable, strict=True) if ok])
-    out["heldout_time"] = np.arange(min(limit, len(proof.waves["measured"]))) / analysis.case.rate
-    return out

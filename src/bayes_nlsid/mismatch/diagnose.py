@@ -16,7 +16,7 @@ from bayes_nlsid.mismatch.case import Case, CaseRecord, read_case
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.disturb import disturbances, without_hum
-from bayes_nlsid.mismatch.effects import Effect, pack
+from bayes_nlsid.mismatch.effects import Effect, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence, gather, level_transfer
 from bayes_nlsid.mismatch.explain import sizes
 from bayes_nlsid.mismatch.linear import Family, family
@@ -27,6 +27,7 @@ from bayes_nlsid.mismatch.prove import Bands, Predictor, calibrate_bands, elpd_d
 from bayes_nlsid.mismatch.rivals import Rival, all_rivals, on_trial
 from bayes_nlsid.mismatch.search import Found, search
 from bayes_nlsid.mismatch.spectra import Spectra, burst_spectra, noise_density, steady_spectra
+from bayes_nlsid.mismatch.words import known
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -183,18 +184,13 @@ def intervals(h: Hypothesis, effect: Effect, dispersion: float, seed: int) -> tu
     draws = rng.multivariate_normal(x0, (covariance + covariance.T) / 2 + 1e-12 * np.eye(count), size=400, method="eigh")
     out = []
     free = list(range(len(effect.values))) if effect.law is None else [i for i, k in enumerate(effect.law.free) if k != "fixed"]
-    for column, i in enumerate(free):
-        if effect.law is None:
-            values = draws[:, column] * max(float(np.abs(effect.values).max()), 1e-12)
-        elif effect.law.free[i] == "log":
-            values = np.exp(np.clip(draws[:, column], -80, 80))
-        else:
-            scale = max(abs(float(effect.values[i])), 1e-12) if effect.law.free[i] == "signed" else 1.0
-            values = draws[:, column] * scale
-        q = np.quantile(values, [0.05, 0.5, 0.95])
+    drawn = np.array([unpack(effect, x, effect).values for x in draws])   # inside the ranges of the law
+    for i in free:
+        q = np.quantile(drawn[:, i], [0.05, 0.5, 0.95])
         out.append({"name": f"{effect.cls}[{effect.place}].{effect.names[i]}", "unit": effect.units[i],
-                    "q05": float(q[0]), "q50": float(q[1]), "q95": float(q[2])})
-    return tuple(out)
+                    "q05": float(q[0]), "q50": float(q[1]), "q95": float(q[2]),
+                    "meaning": "" if effect.law is None else effect.law.term.params[i].meaning})
+    return tuple(out) if effect.law is None else (*out, *known(effect.law, effect.place, effect.values.tolist(), effect.cls))
 
 
 def _linear_intervals(h: Hypothesis, effect: Effect, dispersion: float, rng: np.random.Generator) -> tuple[dict[str, Any], ...]:

@@ -8,25 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrated import Drive, observer_of
 from bayes_nlsid.mismatch.campaign import RIGID, Campaign
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.detected import detect
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.forward import Extended, predict
-from bayes_nlsid.mismatch.innovations import Desk
-from bayes_nlsid.mismatch.observer import Smoothed, observe
 from bayes_nlsid.mismatch.odds import OTHER, Key
 from bayes_nlsid.mismatch.recorded import Evidence, Progress, analyse, silent, start_of, strength
+from bayes_nlsid.mismatch.recorded_portrait import portrait
 from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.mismatch.weigh import Weighed, spread
-from bayes_nlsid.recordings.recording import SI_UNIT
+from bayes_nlsid.mismatch.words import PHASES, WORTH_SAYING, claims, known, of_linear, power_onset, separates, size_of, sure, whole_percent
 
 Array = NDArray[np.float64]
 LISTED = 16
-WORTH_SAYING = 0.02   # probability of a rival from which the sentence names it
-LATENT = 0.03         # modal force of the observer behind the latent force, at least, over the modal acceleration
-THIN = 6000
 
 
 def diagnose_campaign(campaign: Campaign, seed: int = 0, say: Progress = silent) -> Diagnosis:
@@ -67,11 +62,6 @@ def _class_probability(odds: dict[Key, float], effects: Key) -> float:
     return sum(v for k, v in odds.items() if k and {c for c, _ in k} == classes)
 
 
-def claims(effects: Key) -> str:
-    """The effects in words."""
-    return " and ".join(ROWS[c].claim.format(place=p).removesuffix(" at -") for c, p in effects)
-
-
 def _named(found: Evidence, seed: int) -> tuple[Named, ...]:
     ordered = sorted(found.odds.items(), key=lambda kv: -kv[1])
     out: list[Named] = []
@@ -82,21 +72,10 @@ def _named(found: Evidence, seed: int) -> tuple[Named, ...]:
             continue
         effects = key or (("none", "-"),)
         parameters = _parameters(found, key, seed) if p > 0.005 else ()
-        out.append(Named(effects, p, parameters, claims(effects), _separates(effects, ordered)))
+        out.append(Named(effects, p, parameters, claims(effects), separates(effects, ordered)))
     # what is too small to be listed is shared out
     out = [Named(h.effects, h.probability / (1 - rest), h.parameters, h.sentence, h.separated_by) for h in out]
     return tuple(sorted(out, key=lambda h: -h.probability))
-
-
-def _separates(effects: Key, ordered: list[tuple[Key, float]]) -> str:
-    """The test that tells the first class from the likeliest rival of another class, else from what it is usually confused with."""
-    own = {c for c, _ in effects}
-    for key, _ in ordered:
-        rival = [c for c, _ in key if c not in own]
-        if rival and rival[0] in ROWS and rival[0] != "other":
-            row = ROWS[effects[0][0]]
-            return row.test if rival[0] in row.confused or effects[0][0] == "none" else ROWS[rival[0]].test
-    return ROWS[effects[0][0]].test
 
 
 def _parameters(found: Evidence, key: Key, seed: int) -> tuple[dict[str, Any], ...]:
@@ -118,7 +97,8 @@ def _parameters(found: Evidence, key: Key, seed: int) -> tuple[dict[str, Any], .
                 continue
             width = 1.645 * abs(float(value)) * weighed.error / max(weighed.gain, weighed.error, 1e-9)
             out.append({"name": f"{suspect.law.term.name}[{suspect.place}].{q.name}", "unit": q.unit, "q05": float(value) - width,
-                        "q50": float(value), "q95": float(value) + width})
+                        "q50": float(value), "q95": float(value) + width, "meaning": q.meaning})
+        out += known(suspect.law, suspect.place, suspect.parameters(factor).tolist(), suspect.law.term.name)
     return tuple(out)
 
 
@@ -135,8 +115,12 @@ def _intervals(ext: Extended, seed: int) -> tuple[dict[str, Any], ...]:
         if modes <= i < 2 * modes and omega[i - modes] < RIGID:
             # a rigid body has no damping ratio: viscous damping over mass
             name, unit, factor = f"damping[{i - modes + 1}]", "1/s", 2 * float(omega[i - modes])
+        meaning = of_linear(name) if p.param is None else p.param.meaning
         out.append({"name": name, "unit": unit, "q05": factor * float(low[i]), "q50": factor * float(middle[i]),
-                    "q95": factor * float(high[i])})
+                    "q95": factor * float(high[i]), "meaning": meaning})
+    for suspect in ext.suspects:
+        if suspect.law is not None:
+            out += known(suspect.law, suspect.place, strength(suspect, ext).tolist(), suspect.law.term.name)
     return tuple(out)
 
 
@@ -230,7 +214,7 @@ def onset_of(suspect: Suspect, p: Array) -> float:
         return (0.1 if name.startswith("iwan") else 1.0) * float(p[0] / max(p[1], 1e-300))
     if name == "bouc_wen":
         return min(0.1 / max(abs(float(p[1])) * (abs(float(p[2])) + abs(float(p[3]))), 1e-300), size)
-    return 0.5 * size if name == "power_spring" else 0.0
+    return power_onset(suspect.size.peak, float(p[2])) if name == "power_spring" and suspect.size is not None else 0.0
 
 
 def _each(found: Evidence) -> list[dict[str, Any]]:
@@ -297,13 +281,16 @@ def _sentence(found: Evidence, verdict: str, p: float, hypotheses: tuple[Named, 
     own = {c for c, _ in top.effects}
     rivals = [h for h in hypotheses if h.effects != (("none", "-"),) and {c for c, _ in h.effects} != own]
     rival = max(rivals, key=lambda h: _listed(hypotheses, h.effects), default=None)
-    follow = f"; next, {rival.sentence} ({100 * _listed(hypotheses, rival.effects):.0f} %)" \
+    follow = f"; next, {rival.sentence} ({whole_percent(_listed(hypotheses, rival.effects))})" \
         if rival is not None and _listed(hypotheses, rival.effects) > WORTH_SAYING else ""
     helped = found.named is not None
     end = end.replace(" and ", ", ") if helped else end
     proof = f", and {_percent(s['extended'])} with what was found" if helped else ""
     lead = "The recordings differ from any linear model" if verdict == "mismatch" else "It cannot be told for sure what is missing"
-    return f"{lead} (p = {min(p, 0.999):.3g}). Likeliest: {words} ({100 * share:.0f} %){follow}. {end}{proof}; {noise}."
+    onset, phase = where["amplitude"], PHASES.get(where["phase"], "")
+    how = f"; it grows with amplitude from about {size_of(onset['onset'], onset['unit'])}" if onset["onset"] > 0 else ""
+    how += f"; {phase}" if phase else ""
+    return f"{lead} (p {sure(p)}). Likeliest: {words} ({whole_percent(share)}){how}{follow}. {end}{proof}; {noise}."
 
 
 def _listed(hypotheses: tuple[Named, ...], effects: Key) -> float:
@@ -325,51 +312,9 @@ def _sealed(found: Evidence) -> dict[str, Array]:
     return out
 
 
-def _freely(found: Evidence, desk: Desk) -> Smoothed:
-    """A record smoothed by an observer whose modal forces are free to follow it: where the mismatch is faint the likeliest ones are not."""
-    largest = np.maximum(found.drive.force, (LATENT * desk.smoothed.a.std(axis=0)) ** 2)
-    observer = observer_of(found.linear, desk.trial, Drive(largest, found.drive.noise))
-    try:
-        return observe(observer, found.linear.response(desk.trial.recording), desk.force)
-    except (np.linalg.LinAlgError, ValueError):
-        return desk.smoothed
-
-
 def _figures(found: Evidence) -> dict[str, NDArray[Any]]:
     """Numbers behind the figures."""
     ranked = sorted(found.odds.items(), key=lambda kv: -kv[1])[:LISTED]
     names = [" + ".join(f"{c}@{p}" for c, p in key) or "none" for key, _ in ranked]
-    shares: dict[str, float] = {}
-    for w in found.singles:
-        if w.suspects[0].law is not None:
-            shares[w.suspects[0].place] = max(shares.get(w.suspects[0].place, 0.0), w.share)
-    places = sorted(shares, key=lambda n: -shares[n])
-    out: dict[str, NDArray[Any]] = {
-        "hypothesis_names": np.array(names), "hypothesis_probability": np.array([p for _, p in ranked]),
-        "place_names": np.array(places), "place_share": np.array([shares[n] for n in places])}
-    desk = max(found.scale.bench.desks, key=lambda d: d.trial.level)
-    moved = _freely(found, desk)
-    for i, name in enumerate(places[:3]):
-        row = found.linear.model.rows([name])[0]
-        force = -(moved.latent @ row) / float(row @ row)
-        q, v, a = (z @ row for z in (moved.u, moved.v, moved.a))
-        # what a linear model may absorb is taken off, so that the shape of the rest can be seen
-        # (without a measured force the inertia is the force, and nothing would be left without it)
-        design = np.stack([q, v, *([] if desk.trial.recording.free else [a]), np.ones_like(q)], axis=1)
-        norm = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-        force = force - (design / norm) @ np.linalg.lstsq(design / norm, force, rcond=1e-9)[0]
-        every = max(1, len(q) // THIN)
-        for key, value in (("force", force), ("displacement", q), ("velocity", v)):
-            out[f"latent_{i}_{key}"] = value[desk.skip::every]
-    for t in found.campaign.used("judge")[:1]:
-        first = max(s.first for s in found.shown[t.name])
-        piece = slice(first, min(t.recording.n, first + THIN))
-        out["heldout_time"] = t.recording.time[piece]
-        out["heldout_measured"] = t.recording.response[piece]
-        out["heldout_channels"] = np.array([c.name for c in t.recording.channels])
-        out["heldout_units"] = np.array([SI_UNIT[c.quantity] for c in t.recording.channels])
-        out["heldout_name"] = np.array(t.name)
-        for key, s in zip(("nominal", "updated", "extended"), found.shown[t.name], strict=True):
-            if np.isfinite(s.wave).all() and (key != "extended" or found.named is not None):
-                out[f"heldout_{key}"] = s.wave[piece]
-    return out
+    return portrait(found, leading(found)) | {"hypothesis_names": np.array(names),
+                                              "hypothesis_probability": np.array([p for _, p in ranked])}
