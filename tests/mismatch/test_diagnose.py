@@ -43,7 +43,8 @@ def shows_its_effect(f: Mapping[str, np.ndarray], cls: str) -> None:
     if "law_0_curve" in f and cls == f["law_0_class"]:
         own = f["law_0_velocity" if f["law_0_phase"] == "velocity" else "law_0_displacement"]
         at = np.interp(own, f["law_0_grid"], f["law_0_curve"])
-        assert np.abs(at - f["law_0_force"]).max() < 0.05 * np.abs(f["law_0_force"]).max()   # along the motion it is the curve
+        # along the motion it is the curve, but for the corners between points of the curve
+        assert np.quantile(np.abs(at - f["law_0_force"]), 0.98) < 0.05 * np.abs(f["law_0_force"]).max()
     if "law_0_left" in f:
         assert f["law_0_left"].std() < 0.7 * f["law_0_force"].std()
         assert f["record_after"].max() < f["record_before"].max()
@@ -53,6 +54,10 @@ def shows_its_effect(f: Mapping[str, np.ndarray], cls: str) -> None:
     if cls == "added_mass":
         before, after = (np.abs(f["frf_measured"] - f[k]) / f["frf_error"] for k in ("frf_linear", "frf_extended"))
         assert (after ** 2).sum() < 0.7 * (before ** 2).sum()
+        # line by line, without a law, the recordings ask for a mass
+        weight = np.abs(f["attached_law"]) ** 2 / f["attached_sd"] ** 2
+        share = (weight * (f["attached_stiffness"] / f["attached_law"])).sum() / weight.sum()
+        assert abs(share - 1) < 0.1
     if cls == "stiffness_drift":
         assert np.ptp(f["drift_value"]) > 3 * f["drift_error"].max()
     if cls == "clipping":

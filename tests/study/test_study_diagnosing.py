@@ -61,7 +61,10 @@ def numbers(rng: np.random.Generator, effect: str) -> dict[str, Any]:
                 "chain_0_effect": np.exp(-2e-4j * f), "chain_0_sd": np.full(60, 0.01), "chain_0_class": np.array("sensor_delay"),
                 "chain_0_place": np.array("S2")}
     elif effect == "others":
-        out |= {"drift_place": np.array("J1_slip"), "drift_value": np.array([-2e4, 2e4]), "drift_error": np.array([3e3, 3e3]),
+        out |= {"attached_frequency": f, "attached_stiffness": -f ** 2 * (1 + 0.1j), "attached_sd": np.full(60, 9e3),
+                "attached_law": -f ** 2 + 0j,
+                "attached_class": np.array("added_mass"), "attached_place": np.array("P3"), "attached_unit": np.array("N/m"),
+                "drift_place": np.array("J1_slip"), "drift_value": np.array([-2e4, 2e4]), "drift_error": np.array([3e3, 3e3]),
                 "drift_start": np.array([10.0, 25.0]), "drift_unit": np.array("N/m"), "clip_time": f / 1e4,
                 "clip_measured": np.clip(f, 0, 500),
                 "clip_model": f, "clip_level": np.array(500.0), "clip_channel": np.array("S3"), "clip_record": np.array("high_1"),
@@ -102,7 +105,7 @@ ALWAYS = {"where", "distortion", "hypotheses", "transfer_function", "before_afte
 
 @pytest.mark.parametrize(("effect", "more"), [
     ("law", {"latent_force"}), ("loop", {"latent_force"}), ("chain", {"measuring_chain"}),
-    ("others", {"drift", "clipping", "quiet", "free_force"}), ("errors", {"errors"})])
+    ("others", {"attached", "drift", "clipping", "quiet", "free_force"}), ("errors", {"errors"})])
 def test_every_effect_has_its_figures(effect: str, more: set[str]) -> None:
     drawn = pictures(answer(effect=effect))
     assert set(drawn) == ALWAYS | more

@@ -18,10 +18,11 @@ from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.diagnose import Analysis, Proof, Rival
 from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.explain import Latent
+from bayes_nlsid.mismatch.linear import fields, receptances
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Hypothesis, simulate
 from bayes_nlsid.mismatch.prove import Predictor, envelope
-from bayes_nlsid.mismatch.shapes import accelerance
+from bayes_nlsid.mismatch.shapes import accelerance, with_shape_errors
 from bayes_nlsid.mismatch.spectra import local_mean, repeats
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ Numbers = dict[str, NDArray[Any]]
 SHOWN = 6144         # samples of a record that was not used
 SHIFT, GRID = 1e-4, 241
 SEEN = 12.0          # standard deviations of noise alone from which there is something that is not linear
+ATTACHED = ("added_mass", "unmodelled_mode", "other")
 CHAINED = ("force_gain", "force_delay", "sensor_gain", "sensor_delay")
 NOISY = 0.5          # relative error of a measured transfer function beyond which a line is not drawn
 
@@ -52,7 +54,7 @@ def portrait(analysis: Analysis, best: Rival | None, proof: Proof, predictor: Pr
     if best is None:
         return out
     if h is not None:
-        out |= _laws(analysis, h) | _drifts(h, max(analysis.scores.dispersion, 1.0)) | _chains(analysis, h)
+        out |= _laws(analysis, h) | _drifts(h, max(analysis.scores.dispersion, 1.0)) | _chains(analysis, h) | _attached(analysis, h)
     out |= _clipped(analysis, best, h) | _quiet(analysis.case, best)
     if h is None or not h.effects or any(cls == "other" for cls, _ in best.key):
         out |= free_forces(latents, int(np.argmax(analysis.evidence.spectra.levels)))
@@ -259,6 +261,34 @@ def _chains(analysis: Analysis, h: Hypothesis) -> Numbers:
                 f"chain_{shown}_class": np.array(e.cls), f"chain_{shown}_place": np.array(e.place)}
         shown += 1
     return out
+
+
+def _attached(analysis: Analysis, h: Hypothesis) -> Numbers:
+    """Dynamic stiffness of what is attached at one place: as estimated, and line by line as the recordings ask for it without any law.
+
+    With H₀ the model without it, h and r the paths from the place to the channels and to the place, r_F that from the shaker to the
+    place: H = H₀ − h y r_F, y = z / (1 + z r).
+    """
+    fit, fam, modes = h.fit, analysis.family, h.fit.fields.modes
+    attachments, chain = h.parts(fit.measured.shape[1])(fit.s)
+    effect = next((e for e in h.effects if e.cls in ATTACHED), None)
+    if len(attachments) != 1 or effect is None:
+        return {}
+    row = attachments[0].direction[None]
+    bare = fields(fam, modes, fit.s)
+    H0 = with_shape_errors(fam, bare, fit.s, fit.shape_errors)
+    path = accelerance(fam, modes, fit.s, row, fit.shape_errors)[:, :, 0]
+    if chain is not None:
+        H0, path = chain.apply(H0), chain.apply(path)
+    there = receptances(modes, fit.s, row, np.concatenate([row, fam.shaker[None]]))[:, 0]
+    column = path * there[:, 1:]
+    power = (np.abs(column) ** 2 / fit.variance).sum(1)
+    y = -(column.conj() * (fit.measured - H0) / fit.variance).sum(1) / power
+    turn = 1 - y * there[:, 0]
+    return {"attached_frequency": fit.s.imag / 2 / np.pi, "attached_stiffness": y / turn,
+            "attached_sd": 1 / np.sqrt(2 * power) / np.abs(turn) ** 2, "attached_law": np.asarray(attachments[0].z),
+            "attached_class": np.array(effect.cls), "attached_place": np.array(effect.place),
+            "attached_unit": np.array("N m/rad" if "rot" in effect.place.lower() else "N/m")}
 
 
 def _without(model: Complex, chain: Chain) -> Complex:

@@ -12,8 +12,8 @@ from bayes_nlsid.study.sketch import Sketch
 
 Pictures = dict[str, tuple[bytes, str]]
 SECTIONS = {"where": ("where", "distortion", "errors"),
-            "what": ("hypotheses", "latent_force", "latent_force_2", "free_force", "measuring_chain", "measuring_chain_2", "drift",
-                     "clipping", "quiet"),
+            "what": ("hypotheses", "latent_force", "latent_force_2", "free_force", "attached", "measuring_chain", "measuring_chain_2",
+                     "drift", "clipping", "quiet"),
             "proof": ("before_after", "transfer_function")}
 """Names of figures by section, in reading order."""
 
@@ -98,6 +98,13 @@ def _disturbances(f: Mapping[str, Any]) -> Pictures:
     from bayes_nlsid.study.figures import png
 
     out: Pictures = {}
+    if "attached_law" in f:
+        image = png(effects.attached, *(f[f"attached_{k}"] for k in ("frequency", "stiffness", "sd", "law")),
+                    *(str(f[f"attached_{k}"]) for k in ("class", "place", "unit")))
+        out["attached"] = (image, "Force over displacement at the place that the recordings ask for and the rest of the model has not, "
+                                  "line by line without assuming a law, and the effect as estimated. A mass is a parabola that opens downwards, "
+                                  "a spring a constant, a resonator changes sign at its resonance, a relaxing branch stiffens and loses. "
+                                  "The bars are noise alone: what the rest of the model has wrong scatters beyond them.")
     if "drift_value" in f:
         image = png(effects.drift, f["drift_start"], f["drift_value"], f["drift_error"], str(f["drift_place"]), str(f["drift_unit"]))
         out["drift"] = (image, "Stiffness that each record asks for, less the mean of the day: a drift creeps, jumps or settles with time, "

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayes_nlsid.study.axes import scaled
+from bayes_nlsid.study.axes import scaled, unit_sign
 from bayes_nlsid.study.figures import BLUE, GREEN, GREY, ORANGE, RED, SKY, canvas
 
 Array = NDArray[np.float64]
@@ -173,15 +173,40 @@ def measuring_chain(frequency: Array, ratio: Array, effect: Array, sd: Array, cl
             bottom.plot(frequency, np.degrees(np.angle(effect)), color=RED, linewidth=1.6, zorder=5)
         for axes, level in ((top, 1.0), (bottom, 0.0)):
             axes.axhline(level, color="black", linewidth=0.9, linestyle="--")
-        top.set_title(words, pad=18)
-        top.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, markerscale=3, borderaxespad=0.1)
+        top.set_title(words)
         bottom.set_xlabel("frequency (Hz)")
     named = place if place not in ("", "-", "FORCE") else "all channels"
     reach = max(float(np.quantile(np.abs(np.abs(ratio) - 1), 0.95)), float(np.abs(np.abs(effect) - 1).max()), 0.01)
     turn = max(float(np.quantile(np.abs(np.degrees(np.angle(ratio))), 0.95)), float(np.abs(np.degrees(np.angle(effect))).max()), 0.5)
     grid[0][0].set(ylabel=f"size, {named}", ylim=(max(1 - 2 * reach, 0), 1 + 2 * reach))
     grid[1][0].set(ylabel="phase (°)", ylim=(-1.6 * turn, 1.6 * turn))
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2, markerscale=3)
     figure.suptitle(f"{cls.replace('_', ' ')} at {place}", x=0.01, ha="left", fontsize=9.5)
+    return figure
+
+
+def attached(frequency: Array, stiffness: Array, sd: Array, law: Array, cls: str, place: str, unit: str) -> Figure:
+    """Dynamic stiffness that the recordings ask for at a place, line by line, beside that of the effect as estimated.
+
+    Parameters
+    ----------
+    frequency : (e,) Hz. stiffness, law : (e,) complex, ``unit``. sd : (e,) of real and imaginary part.
+    """
+    figure, grid = canvas(1, 2, height=3.3, sharex=True)
+    reach = float(np.abs(law).max())
+    told = sd < 0.3 * reach   # elsewhere the motion there is too small to tell
+    factor, sign = scaled(np.abs(law), unit)
+    parts = ((grid[0][0], np.real, "in phase with displacement"), (grid[0][1], np.imag, "a quarter ahead of it (loss)"))
+    for axes, part, words in parts:
+        axes.errorbar(frequency[told], factor * part(stiffness[told]), yerr=1.645 * factor * sd[told], fmt=".", color="#7d93a6",
+                      markersize=2.5, elinewidth=0.3, label="recordings, line by line (90 %)")
+        axes.plot(frequency, factor * part(law), color=RED, linewidth=1.7, zorder=5, label="as estimated")
+        axes.axhline(0.0, color="black", linewidth=0.9, linestyle="--")
+        axes.set(xlabel="frequency (Hz)", ylim=(-1.5 * factor * reach, 1.5 * factor * reach))
+        axes.set_title(words)
+    grid[0][0].set_ylabel(f"force over displacement\nat {place} ({sign})")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2, markerscale=3)
+    figure.suptitle(f"{'outside the catalogue' if cls == 'other' else cls.replace('_', ' ')} at {place}", x=0.01, ha="left", fontsize=9.5)
     return figure
 
 
@@ -264,7 +289,7 @@ def error_map(numbers: Mapping[str, Any]) -> Figure:
         spectrum.plot([], [], color=GREEN, linewidth=1.0, linestyle="--", label="sensor noise (below)")
     if levels.max() > 10 * max(float(levels.min()), 1e-300):
         level.set_xscale("log")
-    spectrum.set(xlabel="frequency (Hz)", ylabel=f"amplitude density\n({unit}/√Hz)", xlim=(0, f[-1]),
+    spectrum.set(xlabel="frequency (Hz)", ylabel=f"amplitude density\n(({unit_sign(unit)})/√Hz)", xlim=(0, f[-1]),
                  ylim=(1e-6 * float(size.max()), 3 * float(size.max())))
     spectrum.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, columnspacing=1.2)
     time.set(xlabel="time in the record (s)", ylabel=f"rms error of a stretch ({sign})")
