@@ -323,7 +323,7 @@ def _quiet(case: Case, best: Rival) -> Numbers:
     from scipy.signal import welch
 
     accel = offs[0].accel[:, case.usable]
-    f, power = welch(accel, case.rate, nperseg=min(len(accel), int(2 * case.rate)), axis=0, detrend="constant")
+    f, power = welch(accel, case.rate, nperseg=min(len(accel), int(case.rate)), axis=0, detrend="constant")
     names = [n for n, ok in zip(case.sensors, case.usable, strict=True) if ok]
     own = [names.index(places[0])] if places[0] in names else list(range(len(names)))
     others = [i for i in range(len(names)) if i not in own]

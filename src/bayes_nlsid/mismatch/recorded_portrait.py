@@ -33,7 +33,8 @@ def portrait(found: Evidence, best: Weighed | None) -> Numbers:
         if w.suspects[0].law is not None:
             shares[w.suspects[0].place] = max(shares.get(w.suspects[0].place, 0.0), w.share)
     places = sorted(shares, key=lambda n: -shares[n])
-    out: Numbers = {"place_names": np.array(places), "place_share": np.array([shares[n] for n in places])}
+    out: Numbers = {"place_names": np.array(places), "place_share": np.array([shares[n] for n in places]),
+                    "place_share_by": np.array("the best force law")}
     desk = max(found.scale.bench.desks, key=lambda d: d.trial.level)
     lawful = () if best is None else tuple((s, f) for s, f in zip(best.suspects, best.factors, strict=True) if s.law is not None)
     if lawful:

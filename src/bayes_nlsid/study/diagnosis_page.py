@@ -108,7 +108,7 @@ def effects_of(h: Named) -> str:
 
 def _hypotheses(found: Diagnosis) -> str:
     """The ranking, and the estimated numbers of those that have some."""
-    listed = [h for i, h in enumerate(found.hypotheses) if i < 3 or h.probability > 0.001 or {c for c, _ in h.effects} <= {"none", "other"}]
+    listed = [h for i, h in enumerate(found.hypotheses) if i < 3 or h.probability > 0.005 or {c for c, _ in h.effects} <= {"none", "other"}]
     rows = [[effects_of(h), _percent(h.probability), h.separated_by] for h in listed]
     out = html.table(["explanation", "probability", "what would settle it"], rows, "diagnosis.json, hypotheses", (1,))
     values = [[effects_of(h) if i == 0 else "", *_parameter(p)] for h in found.hypotheses[:3] for i, p in enumerate(h.parameters)]

@@ -32,11 +32,12 @@ def _where(found: Diagnosis, sketch: Sketch | None) -> Pictures:
     if locations and found.verdict != "none":
         names, shares = np.asarray(f.get("place_names", np.zeros(0, dtype=str))), np.asarray(f.get("place_share", np.zeros(0)))
         places = [(str(x["name"]), float(x["probability"])) for i, x in enumerate(locations) if i < 3 or x["probability"] > 0.005]
-        image = png(draw.where, places, locations[0].get("indistinguishable_from", []), names.tolist(), shares, sketch)
+        image = png(draw.where, places, locations[0].get("indistinguishable_from", []), names.tolist(), shares, sketch,
+                    *([str(f["place_share_by"])] if "place_share_by" in f else []))
         disc = "Places on the structure, the area of a disc being the probability that something is missing there. "
         out["where"] = (image, (disc if sketch else "") + "Bars: all places of the hypotheses. Grey, where there is something that is not "
-                        "linear: how much of what no linear model explains a force at each place could explain, whatever its law; a fault "
-                        "of the measuring chain or of mass does not show there.")
+                        "linear: how much of what no linear model explains a force at each place takes away; a fault of the measuring "
+                        "chain or of mass does not show there.")
     if "record_before" in f:
         caption = ("What no linear system can explain, whichever it is. Dots: root mean square over channels and records of the response "
                    "on lines without force, and of what is left of it on lines with force; odd and even lines tell even from odd "
@@ -102,9 +103,9 @@ def _disturbances(f: Mapping[str, Any]) -> Pictures:
         image = png(effects.attached, *(f[f"attached_{k}"] for k in ("frequency", "stiffness", "sd", "law")),
                     *(str(f[f"attached_{k}"]) for k in ("class", "place", "unit")))
         out["attached"] = (image, "Force over displacement at the place that the recordings ask for and the rest of the model has not, "
-                                  "line by line without assuming a law, and the effect as estimated. A mass is a parabola that opens downwards, "
-                                  "a spring a constant, a resonator changes sign at its resonance, a relaxing branch stiffens and loses. "
-                                  "The bars are noise alone: what the rest of the model has wrong scatters beyond them.")
+                           "line by line without assuming a law, and the effect as estimated. A mass is a parabola that opens "
+                           "downwards, a spring a constant, a resonator changes sign at its resonance, a relaxing branch stiffens and "
+                           "loses. The bars are noise alone: what the rest of the model has wrong scatters beyond them.")
     if "drift_value" in f:
         image = png(effects.drift, f["drift_start"], f["drift_value"], f["drift_error"], str(f["drift_place"]), str(f["drift_unit"]))
         out["drift"] = (image, "Stiffness that each record asks for, less the mean of the day: a drift creeps, jumps or settles with time, "

@@ -48,14 +48,15 @@ def words_of(name: str) -> str:
     return " + ".join(parts)
 
 
-def where(found: Sequence[tuple[str, float]], alike: Sequence[str], places: Sequence[str], shares: Array, sketch: Sketch | None) -> Figure:
-    """Where the mismatch sits: on a sketch of the structure if there is one, as probabilities, and as what a free force would explain.
+def where(found: Sequence[tuple[str, float]], alike: Sequence[str], places: Sequence[str], shares: Array, sketch: Sketch | None,
+          by: str = "any force, no law assumed,") -> Figure:
+    """Where the mismatch sits: on a sketch of the structure if there is one, as probabilities, and as what a force there would explain.
 
     Parameters
     ----------
     found : (place, probability), likeliest first.
     alike : places that these data cannot tell from the first.
-    places, shares : what share of the mismatch a force without any law would explain at each place.
+    places, shares : what share of the mismatch a force would explain at each place; ``by`` what kind of force.
     """
     order = np.argsort(-shares, kind="stable")[:SHOWN]
     rows = max(min(len(found), SHOWN), len(order), 2)
@@ -84,7 +85,7 @@ def where(found: Sequence[tuple[str, float]], alike: Sequence[str], places: Sequ
     right.barh(at, 100 * np.minimum(shares[order], 1.0), color=GREY, height=0.6)
     right.set(yticks=at, yticklabels=[places[i] for i in order], ylim=(rows - 0.4, -0.6), xlim=(0, 105),
               xlabel="of what is not linear, explained (%)")
-    right.set_title("by any force at that place, no law assumed", fontsize=8.5)
+    right.set_title(f"by {by} at that place", fontsize=8.5)
     right.grid(False, axis="y")
     return figure
 

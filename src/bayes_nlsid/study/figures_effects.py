@@ -245,7 +245,9 @@ def quiet(frequency: Array, own: Array, others: Array | None, place: str, mains:
         for h in (1, 2, 3):
             axes.axvline(h * mains, color=GREEN, linewidth=0.9, linestyle=":", label="mains and harmonics" if h == 1 else None)
     axes.set(xlabel="frequency (Hz)", ylabel="amplitude density\n((m/s²)/√Hz)")
-    axes.legend(loc="upper right")
+    seen = own[keep] if others is None else np.concatenate([own[keep], others[keep]])
+    axes.set_ylim(float(np.quantile(seen, 0.02)) / 2, 2 * float(seen.max()))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
     return figure
 
 
