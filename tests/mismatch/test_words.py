@@ -7,6 +7,9 @@ import pytest
 
 from bayes_nlsid.mismatch.answer import _alike
 from bayes_nlsid.mismatch.catalogue import ROWS
+from bayes_nlsid.mismatch.laws import Size
+from bayes_nlsid.mismatch.recorded_answer import onset_of
+from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.mismatch.words import error_percent, known, power_onset, separates, size_of, sure, whole_percent
 
 ORDERED = [((("hardening", "TIP_w"),), 0.6), ((("clearance", "TIP_w"),), 0.25), ((("added_mass", "P1"), ("hardening", "TIP_w")), 0.1),
@@ -55,3 +58,12 @@ def test_what_a_law_holds_fixed_is_told_with_it() -> None:
     fixed = [q.name for q, kind in zip(law.term.params, law.free, strict=True) if kind == "fixed"]
     assert [p["name"] for p in told] == [f"hardening[J1_slip].{name}" for name in fixed]
     assert told[0]["q05"] == told[0]["q95"] == 2e-6 and told[0]["meaning"]
+
+
+def test_every_spring_of_the_catalogue_has_an_onset_within_the_motion() -> None:
+    size = Size(1e-5, 1e-2, 3e-5)
+    for cls in ("hardening", "softening", "clearance"):
+        for law in ROWS[cls].laws:
+            if law.convert is None:
+                suspect = Suspect(cls, "J1_slip", law, law.shapes(size)[0], size)
+                assert 0 < onset_of(suspect, suspect.shape) < size.peak, law.term.name

@@ -144,12 +144,14 @@ def _onset(analysis: Analysis, best: Rival) -> tuple[float, str]:
         return float(v[1]), unit
     if name in ("one_sided_spring", "bent_spring"):
         return abs(float(v[1] * v[-1])), unit
+    if name == "exponential_spring":
+        return float(v[1]), unit
     if name in ("saturating_spring", "levelling_spring"):
         return 0.1 * float(v[1]), unit
     if name in ("iwan4_memory", "jenkins_memory", "bouc_wen_loop"):
         return (0.1 if name.startswith("iwan") else 1.0) * float(v[0] / max(v[1], 1e-300)), unit
     latent = next((x for x in analysis.found.latents if x.place == e.place), None)
-    if name == "power_spring" and latent is not None:
+    if name in ("power_spring", "falling_spring") and latent is not None:
         return power_onset(float(np.abs(latent.displacement).max()), float(v[2])), unit
     return 0.0, unit
 

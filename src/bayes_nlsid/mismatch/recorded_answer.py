@@ -208,13 +208,15 @@ def onset_of(suspect: Suspect, p: Array) -> float:
         return abs(float(p[1])) * float(p[2])
     if name in ("rounded_gap", "one_stop", "two_stops", "round_stops"):
         return float(p[1])
-    if name == "saturating_spring":
+    if name == "exponential_spring":
+        return float(p[1])
+    if name in ("saturating_spring", "levelling_spring"):
         return 0.1 * float(p[1])
     if name in ("iwan4_memory", "jenkins_memory"):
         return (0.1 if name.startswith("iwan") else 1.0) * float(p[0] / max(p[1], 1e-300))
     if name == "bouc_wen":
         return min(0.1 / max(abs(float(p[1])) * (abs(float(p[2])) + abs(float(p[3]))), 1e-300), size)
-    return power_onset(suspect.size.peak, float(p[2])) if name == "power_spring" and suspect.size is not None else 0.0
+    return power_onset(suspect.size.peak, float(p[2])) if name in ("power_spring", "falling_spring") and suspect.size is not None else 0.0
 
 
 def _each(found: Evidence) -> list[dict[str, Any]]:
