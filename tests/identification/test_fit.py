@@ -17,7 +17,7 @@ from bayes_nlsid.identification.fit import fit
 from bayes_nlsid.identification.noise import freedom, smoothed_variance
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.scenario import scenario
-from bayes_nlsid.identification.select import key, select
+from bayes_nlsid.identification.select import Selection, Step, key, select
 from bayes_nlsid.model import Element, Model
 from tests.identification.test_problem import bouc_wen_run
 from tests.identification.truth import beam, integrated, prescribed, slider, turning
@@ -233,6 +233,16 @@ def test_selection_takes_nothing_from_a_linear_recording():
         problem = Problem(Model(beam(), (), (0,)), (run,), scenario("S2", 3, 0))
         found = select(problem, CANDIDATES, starts=3, seed=1)
         assert found.forward == () and found.fit.mse == pytest.approx(found.mse_linear)
+
+
+def test_only_what_was_kept_has_aliases():
+    """A second term that was added and dropped again leaves no doubt about the first."""
+    first, second = (Element(LIBRARY[name], ("J1", "J2")) for name in ("jenkins_memory", "cubic"))
+    path = (Step(1, "add", key(first), 1.0, True, "", ("a",)), Step(2, "add", key(second), 0.9, True, "", ("b", "c")),
+            Step(3, "remove", key(second), 1.0, True, ""))
+    base = fit(Problem(Model(beam(), (), (0,)), (static_run(),), scenario("S2", 3, 0)))
+    assert Selection((first, second), (first,), path, (), base, 2.0).aliases == ("a",)
+    assert Selection((first, second), (first, second), path[:2], (), base, 2.0).aliases == ("a", "b", "c")
 
 
 def test_selection_tells_a_loop_from_a_spring():

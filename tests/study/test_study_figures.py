@@ -84,6 +84,34 @@ def test_titles_of_tied_joints_do_not_overlap() -> None:
     assert all(box.x1 <= figure.bbox.width and box.width > 10 for box in boxes)
 
 
+def test_draws_over_decades_get_a_logarithmic_axis() -> None:
+    """A slip force between 1 and 1000 N is one bar at zero on a linear axis; a signed or a well-known parameter stays linear."""
+    from matplotlib.patches import Rectangle
+
+    from bayes_nlsid.study import figures_inference as i
+
+    rng = np.random.default_rng(2)
+    draws = np.stack([10 ** rng.uniform(0, 3, 3000), rng.normal(size=3000), rng.normal(80, 0.1, 3000)], axis=1)
+    names, units = ["a.f_s", "a.c", "f[1]"], ["N", "", "Hz"]
+    alone = i.posterior_marginals(draws, names, units, prior=np.abs(draws) * 2).axes[:3]
+    assert [axes.get_xscale() for axes in alone] == ["log", "linear", "linear"]
+    bars = np.array([bar.get_height() for bar in alone[0].patches if isinstance(bar, Rectangle)][:44])
+    assert bars.max() < 2.5 * np.median(bars[bars > 0]), "uniform in the logarithm looks level"
+    assert alone[1].get_xlabel() == "no unit" and alone[2].get_xlabel() == "Hz"
+    pairs = i.posterior_pairs(draws, names, units, worst=[0, 1]).axes
+    assert [(axes.get_xscale(), axes.get_yscale()) for axes in (pairs[0], pairs[2])] == [("log", "linear"), ("log", "linear")]
+
+
+def test_bars_of_damping_tell_how_well_it_is_known() -> None:
+    from bayes_nlsid.study import figures as f
+
+    measured = {"frequency": np.array([80.0, 298.0]), "zeta": np.array([2e-3, 1e-3]), "frequency_sd": np.array([0.02, 0.1]),
+                "number": np.array([1, 2]), "zeta_sd": np.array([1e-4, 9e-4])}
+    middle = f.linear_model(measured, {"frequency": np.array([79.0, 300.0])}, np.eye(2)).axes[1]
+    ends = [segment[:, 0] for line in middle.collections for segment in line.get_segments()]
+    assert ends == [pytest.approx([0.2 - 0.0165, 0.2 + 0.0165]), pytest.approx([0.1 - 0.1485, 0.1 + 0.1485])]
+
+
 def test_energy_of_a_loop() -> None:
     """A viscous loop c·v over a sine of amplitude X at ω loses π c ω X²; every title has three digits and the same unit."""
     from bayes_nlsid.study import figures_prediction as p

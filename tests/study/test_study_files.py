@@ -60,6 +60,19 @@ def test_matrices_in_mm_and_modes_from_a_table(tmp_path: Path) -> None:
     assert "converted to SI" in report and "g → m/s²" in report
 
 
+def test_inputs_are_named_as_seen_from_the_study(tmp_path: Path) -> None:
+    """The same study says the same wherever it lies, also with its recordings in a folder beside it."""
+    found = []
+    for place in ("here", "there"):
+        folder = tmp_path / place / "studies" / "one"
+        (tmp_path / place / "data").mkdir(parents=True)
+        folder.mkdir(parents=True)
+        path = write(folder, STUDY.replace("run.csv", "../../data/run.csv"))
+        (folder / "run.csv").rename(tmp_path / place / "data" / "run.csv")
+        found.append(read_study(path).inputs)
+    assert found[0] == found[1] and "../../data/run.csv" in dict(found[0])
+
+
 @pytest.mark.parametrize(("old", "new", "words"), [
     ('file = "modes.csv"', 'file = "none.csv"', r"\[linear\] file: there is no file"),
     ('file = "modes.csv"', 'file = "modes.csv"\nrecording = "run"', "is given beside recording"),

@@ -44,6 +44,15 @@ def test_finds_what_made_the_recording(finished: Path) -> None:
     assert values["cubic[x].c"] == pytest.approx(4e8, rel=0.1)
 
 
+def test_every_mean_square_is_of_one_kind(finished: Path) -> None:
+    """What is called left and removed compares like with like: the score is the end of the path that begins at the linear model."""
+    (record,) = json.loads((finished / "stages" / "identify" / "data.json").read_text())["variants"]
+    score = timeless(finished)["selection"]["score"]
+    last = [step["mse"] for step in record["path"] if step["accepted"]][-1]
+    assert score["mse"] == pytest.approx(record["mse_of_fit"], rel=1e-3) and score["mse"] <= last * (1 + 1e-6)
+    assert score["floor"] < score["mse"] < 0.05 * score["mse_linear"]
+
+
 def test_the_integration_states_its_band_and_error(finished: Path) -> None:
     """Noise of 0.2 % outside the band is what the example has; a periodic window has no edges."""
     (row,) = json.loads((finished / "stages" / "identify" / "data.json").read_text())["motion"]
@@ -67,6 +76,38 @@ def test_second_run_computes_nothing(small: Path, finished: Path, quick: None, t
     run_study(read_study(small), out)
     assert log_of(out).count("taken from an earlier run") == 3
     assert timeless(out) == timeless(finished)
+
+
+def test_a_prediction_without_posterior(small: Path, finished: Path, quick: None, tmp_path: Path) -> None:
+    """A fit alone has a backbone (no band), joint loops that close, and records it is judged on."""
+    out, path = tmp_path / "out", small.with_name("predicted.toml")
+    shutil.copytree(finished, out)
+    path.write_text(small.read_text(encoding="utf-8") + PREDICTED, encoding="utf-8")
+    result = run_study(read_study(path), out)
+    with np.load(out / "backbone.npz") as found, np.load(out / "stages" / "predict" / "arrays.npz") as arrays:
+        assert np.nanmax(np.abs(found["numerical_error_frequency"])) == pytest.approx(result["backbone"]["numerical_error_hz"])
+        assert np.array_equal(found["frequency_q05"], found["frequency_q95"], equal_nan=True)
+        assert (np.diff(found["frequency_q50"]) > 0).mean() > 0.9, "the spring hardens"
+        q, force = arrays["loop0.q"], arrays["loop0.force"]
+        assert q[0] == pytest.approx(q[-1], abs=1e-9 * np.ptp(q)) and force[0, 0] == pytest.approx(force[0, -1], abs=1e-9 * np.ptp(force))
+        np.testing.assert_allclose(force[0], next(p["fit"] for p in result["parameters"] if p["name"] == "cubic[x].c") * q**3, rtol=1e-9,
+                                   atol=1e-12)
+    assert result["heldout"]["nrmse"] < 0.02 and result["heldout"]["coverage90"] is None
+
+
+def test_an_integrator_too_coarse_for_its_band_is_told() -> None:
+    from types import SimpleNamespace
+
+    from bayes_nlsid.study.stage_predict import _coarse
+
+    def bands(error: float, width: float, samples: int = 200) -> Any:
+        return SimpleNamespace(frequency=80.0 + np.array([[0.0], [0.5], [1.0]]) * np.full(5, width),
+                               numerical_error_frequency=np.array([np.nan, 0.0, error, 0.0, 0.0]), samples_frequency=np.zeros((samples, 5)))
+
+    (said,) = _coarse(bands(-0.03, 0.01), "hht")
+    assert "up to 0.03 Hz" in said and "0.01 Hz wide" in said and 'scheme = "exponential"' in said
+    assert not _coarse(bands(-1e-4, 0.01), "hht") and not _coarse(bands(-0.03, 0.01, 1), "hht")
+    assert "exponential" not in _coarse(bands(-0.03, 0.01), "exponential")[0]
 
 
 @pytest.mark.parametrize(("right", "wrong", "reused"), [
@@ -254,6 +295,13 @@ def test_the_log_tells_a_colleague_what_was_done(finished: Path, small: Path, tm
 def test_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
+
+PREDICTED = """
+[prediction]
+at = "x"
+amplitude = "1 mm"
+heldout = ["later part"]
+"""
 
 SAMPLED = """
 [posterior]

@@ -83,8 +83,10 @@ class Selection:
 
     @property
     def aliases(self) -> tuple[str, ...]:
-        """Candidates that the recordings do not tell from a chosen one."""
-        return tuple(sorted({name for step in self.path if step.accepted and step.action == "add" for name in step.aliases}))
+        """Candidates that the recordings do not tell from a chosen one; what was dropped again has none."""
+        kept = {key(element) for element in self.backward}
+        return tuple(sorted({name for step in self.path if step.accepted and step.action == "add" and step.element in kept
+                             for name in step.aliases}))
 
 
 def key(element: Element) -> str:

@@ -140,7 +140,7 @@ def iirs(structure: Structure, masters: Sequence[str] | ArrayLike, *, iterations
         T = T_s + S(structure.M @ (T @ np.linalg.solve(M_r, K_r)))
         M_r, K_r = project(structure.M, T), project(structure.K, T)
         history.append(target.step(T, M_r, K_r))
-    method = "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iterations"
+    method = "guyan" if len(history) == 1 else f"iirs, {len(history) - 1} iteration{'s'[:len(history) > 2]}"
     return target.reduced(names, T, (M_r, K_r), history, method, held.notes, tolerance, least_mac)
 
 

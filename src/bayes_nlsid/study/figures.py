@@ -211,7 +211,8 @@ def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac:
     Parameters
     ----------
     measured : dict
-        ``frequency`` (k,) Hz, ``zeta`` (k,), ``frequency_sd`` (k,) Hz, ``number`` (k,) 1-based numbers of the modes.
+        ``frequency`` (k,) Hz, ``zeta`` (k,), ``frequency_sd`` (k,) Hz, ``number`` (k,) 1-based numbers of the modes; ``zeta_sd`` (k,) draws
+        bars of 90 % on the damping.
     model : dict
         ``frequency`` (k,) Hz of the same modes after updating.
     mac : ndarray (k, k)
@@ -234,11 +235,13 @@ def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac:
         left.plot(100 * (before / measured["frequency"] - 1), place, "o", color=GREY, mfc="white", label="model as stated")
     left.errorbar(100 * (model["frequency"] / measured["frequency"] - 1), place,
                   xerr=165 * measured["frequency_sd"] / measured["frequency"],
-                  fmt="s", color=BLUE, capsize=2.5, label="model updated (bar: 90 % of the measurement)")
+                  fmt="s", color=BLUE, capsize=2.5, label="model updated (bars: 90 % of the measurement)")
     left.axvline(0, color="black", linewidth=0.8)
     left.set(yticks=place, yticklabels=[f"mode {n}\n{f:.4g} Hz" for n, f in zip(numbers, measured["frequency"], strict=True)],
              xlabel="model − measured (%)", ylim=(k - 0.5, -0.5))
-    middle.barh(place, 100 * measured["zeta"], color=SKY, height=0.55)
+    spread = np.nan_to_num(np.asarray(measured.get("zeta_sd", np.zeros(k)), dtype=float))
+    middle.barh(place, 100 * measured["zeta"], color=SKY, height=0.55, xerr=165 * spread if spread.any() else None, capsize=2.5,
+                error_kw={"elinewidth": 1.0})
     middle.set(yticks=place, yticklabels=numbers, xlabel="damping measured (% of critical)", ylim=(k - 0.5, -0.5), ylabel="mode")
     image = right.imshow(mac, vmin=0, vmax=1, cmap="cividis")
     right.grid(False)
@@ -274,3 +277,5 @@ def _draw_shapes(figure: Figure, grid: Any, shapes: Mapping[str, Array], numbers
         axes.set(title=f"mode {number}", ylim=(-1.25, 1.25), yticks=[-1, 0, 1], xlabel=axis_label("position", "m"))
         if j:
             axes.set_yticklabels([])
+        else:
+            axes.set_ylabel("shape (largest = 1)")

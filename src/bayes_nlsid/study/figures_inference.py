@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from bayes_nlsid.study.axes import brief_names, scaled
 from bayes_nlsid.study.figures import BLUE, CYCLE, GREEN, GREY, RED, WIDTH, canvas, fitted
 
 Array = NDArray[np.float64]
+DECADE = 10.0  # ratio of the 95 % to the 5 % quantile from which an axis is logarithmic
 
 
 def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mapping[str, object]], *, floor: float | None,
@@ -52,7 +55,7 @@ def selection_path(steps: Sequence[Mapping[str, object]], tried: Sequence[Mappin
     if floor is not None and floor > 0:
         left.axhline(floor, color=GREEN, linestyle="--", linewidth=1.2, label="noise floor")
     left.set_yscale("log")
-    left.set(xticks=at, xlabel="step", ylabel="mean square residual")
+    left.set(xticks=at, xlabel="step", ylabel="mean square residual (N²/kg)")
     left.set_xticklabels(labels, rotation=30 if len(labels) > 3 else 0, ha="right" if len(labels) > 3 else "center")
     if left.get_legend_handles_labels()[0]:
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handletextpad=0.3, columnspacing=0.8)
@@ -76,7 +79,8 @@ def _first_ranking(axes: Axes, tried: Sequence[Mapping[str, object]], floor: flo
     if floor is not None and floor > 0:
         axes.axvline(floor, color=GREEN, linestyle="--", linewidth=1.2)
     axes.set_xscale("log")
-    axes.set(yticks=at, yticklabels=[name for _, name in first], ylim=(len(first) - 0.5, -0.7), xlabel="mean square residual, first step")
+    axes.set(yticks=at, yticklabels=[name for _, name in first], ylim=(len(first) - 0.5, -0.7),
+             xlabel="mean square residual, first step (N²/kg)")
 
 
 def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str], *, prior: Array | None = None, fit: Array | None = None,
@@ -106,23 +110,46 @@ def posterior_marginals(draws: Array, names: Sequence[str], units: Sequence[str]
             continue
         factor, unit = scaled(np.quantile(np.abs(draws[:, i]), [0.5]), units[i])
         values = factor * draws[:, i]
-        low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
-        span = np.quantile(values, [0.001, 0.999]) + np.array([-0.05, 0.05]) * max(np.ptp(values), 1e-12 * abs(middle) + 1e-300)
-        bins = np.linspace(float(span[0]), float(span[1]), 45)
-        axes.hist(values, bins=bins, density=True, color=BLUE, alpha=0.75, label="posterior")
+        low, high = np.quantile(values, [0.05, 0.95])
+        bins = _bins(values)
+        if wide(values):
+            axes.set_xscale("log")
+        axes.hist(values, bins=bins, weights=np.full(len(values), 1 / len(values)), color=BLUE, alpha=0.75, label="posterior")
         if prior is not None:
-            inside = factor * prior[:, i]
-            axes.hist(inside, bins=bins, weights=np.full(len(inside), 1 / (len(inside) * (bins[1] - bins[0]))), histtype="step", color=GREY,
+            axes.hist(factor * prior[:, i], bins=bins, weights=np.full(len(prior), 1 / len(prior)), histtype="step", color=GREY,
                       linestyle="--", linewidth=1.1, label="prior")
         axes.axvspan(low, high, color=BLUE, alpha=0.10, linewidth=0, label="90 % interval")
         if fit is not None:
             axes.axvline(factor * fit[i], color=RED, linewidth=1.2, label="least squares")
         axes.set_title(titles[i], fontsize=8, color="black" if known[i] else RED)
-        axes.set(yticks=[], xlim=span, xlabel=unit or "–")
-        axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.set(yticks=[], xlim=(bins[0], bins[-1]), xlabel=unit or "no unit")
+        _few_ticks(axes.xaxis, wide(values), 3)
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
+
+
+def wide(values: Array) -> bool:
+    """Whether draws (D,) spread over a decade of one sign, so that a logarithmic axis shows them better."""
+    low, high = np.quantile(values, [0.05, 0.95])
+    return bool(values.min() > 0 and high > DECADE * low)
+
+
+def _bins(values: Array, count: int = 45) -> Array:
+    """Edges of a histogram of draws (D,): all but the outermost of them and a margin, equal on the axis that `wide` asks for."""
+    edges = np.quantile(np.log(values) if wide(values) else values, [0.001, 0.999])
+    margin = 0.05 * max(float(np.ptp(edges)), 1e-12 * float(np.abs(edges).max()) + 1e-300)
+    even = np.linspace(edges[0] - margin, edges[1] + margin, count)
+    return np.asarray(np.exp(even) if wide(values) else even)
+
+
+def _few_ticks(axis: Axis, logarithmic: bool, most: int, prune: Literal["both"] | None = None) -> None:
+    """At most a few labels on a small axis."""
+    if logarithmic:
+        axis.set_major_locator(LogLocator(numticks=most + 1))
+        axis.set_minor_formatter(NullFormatter())
+    else:
+        axis.set_major_locator(MaxNLocator(most, prune=prune))
 
 
 def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *, worst: Sequence[int], fit: Array | None = None) -> Figure:
@@ -147,19 +174,25 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
                 continue
             fx, ux = scaled(np.quantile(np.abs(draws[:, column]), [0.5]), units[column])
             fy, uy = scaled(np.quantile(np.abs(draws[:, row]), [0.5]), units[row])
+            by_log = wide(draws[:, column]), wide(draws[:, row])
+            if by_log[0]:
+                axes.set_xscale("log")
             if i == j:
-                axes.hist(fx * draws[:, row], bins=40, color=BLUE, alpha=0.75)
+                axes.hist(fx * draws[:, row], bins=_bins(fx * draws[:, row]), color=BLUE, alpha=0.75)
                 axes.set_yticks([])
             else:
                 axes.plot(fx * some[:, column], fy * some[:, row], ".", color=BLUE, markersize=1.6, alpha=0.35, rasterized=True)
-                correlation = np.corrcoef(draws[:, column], draws[:, row])[0, 1]
+                if by_log[1]:
+                    axes.set_yscale("log")
+                shown = [np.log(x) if log else x for x, log in zip((draws[:, column], draws[:, row]), by_log, strict=True)]
+                correlation = np.corrcoef(*shown)[0, 1]
                 axes.text(0.96, 0.95, f"ρ = {correlation:+.2f}", transform=axes.transAxes, ha="right", va="top", fontsize=7,
                           bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0})
                 if fit is not None:
                     axes.plot(fx * fit[column], fy * fit[row], "+", color=RED, markersize=9, markeredgewidth=1.6)
-            axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
+            _few_ticks(axes.xaxis, by_log[0], 2, prune="both")
             if i != j:
-                axes.yaxis.set_major_locator(MaxNLocator(3))
+                _few_ticks(axes.yaxis, by_log[1], 3)
             if i == k - 1:
                 axes.set_xlabel(fitted(short[column] + (f" ({ux})" if ux else ""), WIDTH / k - 0.45, 7), fontsize=7)
             else:
@@ -167,7 +200,7 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
             if j == 0 and i > 0:
                 axes.set_ylabel(fitted(short[row] + (f" ({uy})" if uy else ""), 1.1, 7), fontsize=7)
             elif i != j:
-                axes.set_yticklabels([])
+                axes.tick_params(labelleft=False)
     return figure
 
 

@@ -86,7 +86,8 @@ def _linear(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
             shapes = {"position": x, "measured": saved.arrays["measured_shapes"], "line_position": along, "line": line,
                       "at_sensors": np.stack([np.interp(x, along, column) for column in line.T], axis=1)}
     image = png(linear_model, {"frequency": np.array([r["measured_hz"] for r in rows]), "zeta": np.array([r["zeta"] for r in rows]),
-                               "frequency_sd": np.array([r["measured_sd"] for r in rows]), "number": np.array([r["number"] for r in rows])},
+                               "frequency_sd": np.array([r["measured_sd"] for r in rows]), "number": np.array([r["number"] for r in rows]),
+                               "zeta_sd": np.array([r["zeta_sd"] for r in rows], dtype=float)},
                 {"frequency": np.array([r["model_hz"] for r in rows])}, np.asarray(saved.arrays["mac"], dtype=float), shapes=shapes,
                 before=stated)
     caption = ("The linear model against the modes measured at low level: frequency error before and after updating, measured damping, "

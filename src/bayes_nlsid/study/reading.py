@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -97,10 +98,10 @@ def _parse(file: Path) -> dict[str, Any]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    try:
-        return path.relative_to(folder.resolve()).as_posix()
-    except ValueError:
-        return path.as_posix()
+    """As seen from the study's folder, so that the same study says the same wherever it lies; whole where they share nothing."""
+    here = folder.resolve()
+    shared = path.anchor == here.anchor and os.path.commonpath([path, here]) != here.anchor
+    return Path(os.path.relpath(path, here)).as_posix() if shared else path.as_posix()
 
 
 def _check_order(file: Path, identification: bool, later: Mapping[str, object], recordings: Sequence[RecordingSpec]) -> None:

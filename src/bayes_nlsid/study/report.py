@@ -123,7 +123,8 @@ def _selection(report: Report) -> str:
                      f"{100 * share:.1f} %",
                      record["status"]])
     head = ["form", "force laws", "mean square, linear", "with them", "noise floor", "explained", "fit"]
-    out = html.table(head, rows, f"stages/identify, scenario {saved.data['scenario']}", numeric=(2, 3, 4, 5))
+    how = "mean squares in N²/kg, weighted by the noise of the sensors where it is known"
+    out = html.table(head, rows, f"stages/identify, scenario {saved.data['scenario']}; {how}", numeric=(2, 3, 4, 5))
     steps = [[record["name"], s["action"], brief(s["element"]), f"{s['mse']:.4g}", "yes" if s["accepted"] else "no", brief(s["reason"])]
              for record in saved.data["variants"] for s in record.get("path", [])]
     if steps:
@@ -170,7 +171,7 @@ def _posterior(report: Report) -> str:
     facts = [["ensembles × steps", f"{c['ensembles']} × {c['steps']}"], ["converged", "yes" if c["converged"] else "no"],
              ["largest R-hat over ensembles", f"{c['rhat_max']:.4f}" if c["rhat_max"] is not None else "–"],
              ["smallest effective sample size", f"{c['ess_min']:.0f}" if c["ess_min"] is not None else "–"],
-             ["stuck walkers", str(c["stuck_walkers"])]]
+             ["walkers re-drawn in burn-in, or stuck after it", str(c["stuck_walkers"])]]
     out += html.table(["sampler", ""], facts, "stages/posterior")
     out += stages_section(saved.data, parameters)
     priors = [[brief(p["parameter"]), brief(p["text"])] for p in saved.data.get("priors", [])]

@@ -51,7 +51,7 @@ def summary(result: Mapping[str, Any], out: Path) -> str:
         rhat = "-" if c["rhat_max"] is None else f"{c['rhat_max']:.3f}"
         ess = "-" if c["ess_min"] is None else f"{c['ess_min']:.0f}"
         parts.append(f"\nsampler: {c['ensembles']} ensembles x {c['steps']} steps, {'converged' if c['converged'] else 'NOT converged'}, "
-                     f"R-hat {rhat}, effective draws {ess}, stuck walkers {c['stuck_walkers']}")
+                     f"R-hat {rhat}, effective draws {ess}, walkers re-drawn or stuck {c['stuck_walkers']}")
     h = result.get("heldout") or {}
     if h.get("nrmse") is not None:
         parts.append(f"held out ({', '.join(h['records'])}): NRMSE {percent(h['nrmse'])}, noise floor {floor_text(h)}"

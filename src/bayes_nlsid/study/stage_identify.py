@@ -188,7 +188,8 @@ def _refined(context: Context, found: Fit, progress: Any) -> Fit:
 
 def _record(name: str, found: Fit, linear: float, selection: Selection | None) -> dict[str, Any]:
     problem = found.problem
-    regression = float(problem.mse(found.theta)) if np.isfinite(found.theta).all() else found.mse
+    # under the weights of the search, so that it compares with the linear model, the path and the floor; the fit may have had others
+    regression = float(problem.mse(found.theta, problem.default_weight)) if np.isfinite(found.theta).all() else found.mse
     record: dict[str, Any] = {
         "name": name, "elements": [element_record(e) for e in problem.model.elements], "names": list(problem.names),
         "units": [p.unit for p in problem.model.parameters], "mse": regression, "mse_of_fit": found.mse, "mse_linear": linear,

@@ -21,6 +21,8 @@ from bayes_nlsid.study.stage_identify import band_of, observed, stored_model
 from bayes_nlsid.study.stage_read import refuse_driven
 
 LOOP_SAMPLES = 200
+COARSE = 0.25
+"""Share of the width of the band from which the integrator's error is told."""
 AROUND = (0.5, 1.6)
 """Band of the backbone of a mode, relative to its frequency, where the study states none."""
 Array = NDArray[np.float64]
@@ -55,7 +57,22 @@ def predict(context: Context) -> Result:
     data["status"] = "ok" if not failed else "backbone samples: " + ", ".join(f"{count} {name}" for name, count in failed.items())
     data["all_failed"] = bool(failed) and not bands.status.get("ok", 0)
     data["backbone"] = _summary(arrays)
+    data["notes"] += _coarse(bands, entry.scheme)
     return arrays, data
+
+
+def _coarse(bands: Bands, scheme: str) -> list[str]:
+    """That the integrator's own error is not small against the band it draws; nothing where it is, or where there is no band."""
+    width = bands.frequency[2] - bands.frequency[0]
+    seen = np.isfinite(width) & np.isfinite(bands.numerical_error_frequency)
+    if len(bands.samples_frequency) < 2 or not seen.any():
+        return []
+    error, wide = float(np.abs(bands.numerical_error_frequency[seen]).max()), float(np.median(width[seen]))
+    if error <= COARSE * wide:
+        return []
+    mend = 'scheme = "exponential" or a higher fs' if scheme == "hht" else "a higher fs"
+    return [f"the integrator's own error, up to {error:.1g} Hz, is not small against the band of the frequency, {wide:.1g} Hz wide: write "
+            f"{mend} under [prediction]"]
 
 
 def posterior_draws(context: Context, theta: Array, count: int, stage: str = "predict") -> Array:
@@ -144,7 +161,7 @@ def _loops(context: Context, model: Model, draws: Array, arrays: Arrays, data: d
             force = force_along(element.term, path, model.element_values(draws, e, location), excess=element.excess)
             i = len(data["loops"])
             data["loops"].append({"location": location, "term": element.term.name, "amplitude": size})
-            arrays |= {f"loop{i}.q": path.q[-LOOP_SAMPLES:], f"loop{i}.force": force[:, -LOOP_SAMPLES:]}
+            arrays |= {f"loop{i}.q": path.q[-LOOP_SAMPLES - 1:], f"loop{i}.force": force[:, -LOOP_SAMPLES - 1:]}  # ends where it began
 
 
 def _heldout(context: Context, entry: PredictionEntry, model: Model, draws: Array, arrays: Arrays, data: dict[str, Any]) -> None:
