@@ -243,6 +243,7 @@ def linear_model(measured: Mapping[str, Array], model: Mapping[str, Array], mac:
     middle.barh(place, 100 * measured["zeta"], color=SKY, height=0.55, xerr=165 * spread if spread.any() else None, capsize=2.5,
                 error_kw={"elinewidth": 1.0})
     middle.set(yticks=place, yticklabels=numbers, xlabel="damping measured (% of critical)", ylim=(k - 0.5, -0.5), ylabel="mode")
+    middle.set_xlim(left=0.0)
     image = right.imshow(mac, vmin=0, vmax=1, cmap="cividis")
     right.grid(False)
     right.set(xticks=place, yticks=place, xticklabels=numbers, yticklabels=numbers, xlabel="model mode", ylabel="measured mode",
