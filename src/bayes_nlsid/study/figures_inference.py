@@ -184,8 +184,8 @@ def posterior_pairs(draws: Array, names: Sequence[str], units: Sequence[str], *,
                 axes.plot(fx * some[:, column], fy * some[:, row], ".", color=BLUE, markersize=1.6, alpha=0.35, rasterized=True)
                 if by_log[1]:
                     axes.set_yscale("log")
-                shown = [np.log(x) if log else x for x, log in zip((draws[:, column], draws[:, row]), by_log, strict=True)]
-                correlation = np.corrcoef(*shown)[0, 1]
+                shown = np.stack([np.log(x) if log else x for x, log in zip((draws[:, column], draws[:, row]), by_log, strict=True)])
+                correlation = np.corrcoef(shown)[0, 1]
                 axes.text(0.96, 0.95, f"ρ = {correlation:+.2f}", transform=axes.transAxes, ha="right", va="top", fontsize=7,
                           bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0})
                 if fit is not None:
