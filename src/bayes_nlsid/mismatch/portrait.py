@@ -226,8 +226,10 @@ def _drifts(h: Hypothesis, dispersion: float) -> Numbers:
         size = len(pack(e))
         if e.law is None:
             unit = max(float(np.abs(e.values).max()), 1e-12)
-            covariance = np.linalg.pinv(h.curvature)[edge:edge + size, edge:edge + size] * dispersion
-            out |= {"drift_place": np.array(e.place), "drift_value": e.values, "drift_names": np.array(e.names),
+            # the mean of the day is the linear model's: only deviations from it are told
+            centre = np.eye(size) - 1 / size
+            covariance = centre @ np.linalg.pinv(h.curvature)[edge:edge + size, edge:edge + size] @ centre * dispersion
+            out |= {"drift_place": np.array(e.place), "drift_value": centre @ e.values, "drift_names": np.array(e.names),
                     "drift_start": np.array([_number(n) for n in e.names]), "drift_error": unit * np.sqrt(np.abs(np.diag(covariance))),
                     "drift_unit": np.array(e.units[0])}
         edge += size

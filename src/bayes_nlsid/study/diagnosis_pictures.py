@@ -41,8 +41,8 @@ def _where(found: Diagnosis, sketch: Sketch | None) -> Pictures:
     if "record_before" in f:
         caption = ("What no linear system can explain, whichever it is. Dots: root mean square over channels and records of the response "
                    "on lines without force, and of what is left of it on lines with force; odd and even lines tell even from odd "
-                   "nonlinearity. Below: the same by record against its noise; what follows the level is not linear, what follows the time "
-                   "of day drifts.")
+                   "nonlinearity. Below: "
+                   "the same by record, over what noise leaves there, in the order of the test day.")
         out["distortion"] = (png(draw.distortion, f), caption)
     if "error_frequency" in f:
         from bayes_nlsid.study.figures_effects import error_map
