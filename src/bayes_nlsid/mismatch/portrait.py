@@ -56,7 +56,7 @@ def portrait(analysis: Analysis, best: Rival | None, proof: Proof, predictor: Pr
     if h is not None:
         out |= _laws(analysis, h) | _drifts(h, max(analysis.scores.dispersion, 1.0)) | _chains(analysis, h) | _attached(analysis, h)
     out |= _clipped(analysis, best, h) | _quiet(analysis.case, best)
-    if h is None or not h.effects or any(cls == "other" for cls, _ in best.key):
+    if (h is None and not best.clip and not best.extra) or any(cls == "other" for cls, _ in best.key):
         out |= free_forces(latents, int(np.argmax(analysis.evidence.spectra.levels)))
     return out
 
