@@ -13,6 +13,7 @@ from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.linear import Family
 
 Array = NDArray[np.float64]
+WORTH = 5.0  # gain of the first look below which clipping is not pursued
 
 
 def suspects(case: Case, noise: Array) -> list[tuple[int, float]]:
@@ -58,29 +59,25 @@ def undo(evidence: Evidence, fit: LinearFit, channel: int, level: float) -> Evid
     return replace(evidence, residual=residual, H=H)
 
 
-def fit_clipping(fam: Family, evidence: Evidence, fit: LinearFit, channel: int, level: float) -> tuple[float, Evidence, LinearFit, float]:
-    """Level, cleaned evidence, recalibrated model and total −2 log likelihood with one channel clipped."""
+def fit_clipping(fam: Family, evidence: Evidence, fit: LinearFit, channel: int, level: float
+                 ) -> tuple[float, Evidence, LinearFit, float] | None:
+    """Level, cleaned evidence, recalibrated model and total −2 log likelihood with one channel clipped; None if no level near ``level``
+    explains anything."""
+    grid = level * np.linspace(0.85, 1.08, 12)
+    if min(undo(evidence, fit, channel, float(x)).chi2 for x in grid) > evidence.chi2 - WORTH:
+        return None
     s = evidence.spectra.s[evidence.excited]
     variance = floored(evidence.H, evidence.variance)
     # the first model must not know the clipped channel
     blind = variance.copy()
     blind[:, channel] *= 1e6
-    theta, _, _ = descend(fam, fit.theta, s, evidence.H, blind, 8)
-    now = finish(fam, theta, s, evidence.H, blind)
-    best: tuple[float, float, Evidence, LinearFit] | None = None
-    for grid in (level * np.linspace(0.85, 1.08, 12), None, None):
-        if grid is None:
-            assert best is not None
-            grid = best[1] * np.linspace(0.985, 1.015, 7)
-        for trial in grid:
-            cleaned = undo(evidence, now, channel, float(trial))
-            cost = cleaned.chi2
-            if best is None or cost < best[0]:
-                best = (cost, float(trial), cleaned, now)
-        assert best is not None
-        theta, _, _ = descend(fam, now.theta, s, best[2].H, variance, 6)
-        now = finish(fam, theta, s, best[2].H, variance)
-        best = (undo(evidence, now, channel, best[1]).chi2, best[1], undo(evidence, now, channel, best[1]), now)
-    assert best is not None
-    total = best[0] + best[3].cost + np.log(max(evidence.H.size, 2))
-    return best[1], best[2], best[3], float(total)
+    theta, _, _ = descend(fam, fit.theta, s, evidence.H, blind, 8, prior_sd=fit.sd, spread=fit.spread)
+    now = finish(fam, theta, s, evidence.H, blind, prior_sd=fit.sd, spread=fit.spread, rounds=0)
+    for turn in range(3):
+        cost, best = min((undo(evidence, now, channel, float(x)).chi2, float(x)) for x in grid)
+        cleaned = undo(evidence, now, channel, best)
+        theta, _, _ = descend(fam, now.theta, s, cleaned.H, variance, 6, prior_sd=fit.sd, spread=fit.spread)
+        now = finish(fam, theta, s, cleaned.H, variance, prior_sd=fit.sd, spread=fit.spread, rounds=6 if turn == 2 else 0)
+        grid = best * np.linspace(0.985, 1.015, 7)
+    cleaned = undo(evidence, now, channel, best)
+    return best, cleaned, now, float(cleaned.chi2 + now.cost + np.log(max(evidence.H.size, 2)))

@@ -145,11 +145,11 @@ def _clipping(case: Case, bench: Bench, fit: LinearFit, none: float, places: lis
     flat = suspects(case, noise)
     for channel, level in (lone + [s for s in flat if all(s[0] != c for c, _ in lone)])[:2]:
         say(f"undoing the clipping of {bench.channels[channel]}")
-        level, cleaned, refit, cost = fit_clipping(bench.family, bench.evidence, fit, channel, level)
-        gain = none - cost
-        name = bench.channels[channel]
-        if gain < 10:
+        undone = fit_clipping(bench.family, bench.evidence, fit, channel, level)
+        if undone is None or none - undone[3] < 10:
             continue
+        level, cleaned, refit, cost = undone
+        gain, name = none - cost, bench.channels[channel]
         effect = Effect("clipping", name, None, np.array([level]), ("level",), ("m/s^2",))
         lost = _clipped_share(bench.evidence, refit, channel, level)
         alone = Rival((("clipping", name),), gain, 0.0, _only_linear(refit, cleaned, cost), ((channel, level),), (effect,), (lost,))
