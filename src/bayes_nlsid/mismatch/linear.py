@@ -303,10 +303,9 @@ def dashpot_columns(fam: Family, fld: Fields, s: Complex, at: NDArray[np.intp]) 
     """(len(at), L, S): change of the accelerance per N s/m of dashpots, what it does to each mode's own damping apart (that has its own
     deviation already)."""
     rows = fam.dashpots[at] @ fld.modes.basis[:, :fld.right.shape[1]]
-    out = np.empty((len(at), *fld.H.shape), dtype=complex)
-    for k, b in enumerate(rows):
-        out[k] = (fld.right @ b)[:, None] * (fld.left @ b) - (fld.left @ (fld.right * b ** 2)[:, :, None])[:, :, 0]
-    return np.asarray(-(s ** 3)[:, None] * out)
+    through = (fld.right @ rows.T)[:, None, :] * (fld.left @ rows.T)                                     # (L, S, D)
+    own = fld.left @ (fld.right[:, :, None] * (rows ** 2).T)
+    return np.moveaxis(-(s ** 3)[:, None, None] * (through - own), 2, 0)
 
 
 def coupling(modes: Modes, s: Complex, attach: tuple[Attachment, ...]) -> Complex:
@@ -384,9 +383,11 @@ def _mixing_columns(fam: Family, fld: Fields, s: Complex, near: int, turned: tup
     out = left[i] * right[j] + left[j] * right[i]
     still, moving = turned
     low, low_right = fld.left[:, :, :near], fld.right[:, :near]
-    for k, (a, b) in enumerate(zip(rows[i, :near], rows[j, :near], strict=True)):
-        A = np.outer(a, b) + np.outer(b, a)
-        out[k] += (low @ (low_right @ (A * still) + s[:, None] * (low_right @ (A * moving)))[:, :, None])[:, :, 0]
+    A = rows[i, :near, None] * rows[j, None, :near]
+    A = A + np.swapaxes(A, 1, 2)
+    flat = np.concatenate([np.moveaxis(A * w, 0, 1).reshape(near, -1) for w in (still, moving)], axis=1)     # (near, 2 pairs near)
+    turning, moved = np.split((low_right @ flat).reshape(len(s), 2 * len(i), near), 2, axis=1)
+    out += np.moveaxis(low @ np.swapaxes(turning + s[:, None, None] * moved, 1, 2), 2, 0)
     return np.asarray(-(s ** 2)[:, None] * out)
 
 

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
 SECOND = 25.0  # the same for a second effect
+CLEAR = 1000.0  # gain of a linear effect that its column promises nearly rightly
 CHARGED = 6.0  # the same for each parameter: less than what it will be charged
 
 
@@ -210,7 +211,8 @@ def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]
     candidates = [c for c in candidates if _worth(c)]
     if not candidates:
         return []
-    limit = max(WORTH, 0.15 * candidates[0].gain)
+    top = candidates[0].gain
+    limit = max(WORTH, (0.15 if top < CLEAR else 0.5) * top)
     return [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
 
 
