@@ -118,7 +118,7 @@ def backbone_bands(bands: Mapping[str, Array], measured: Mapping[str, Array] | N
     left.set_ylabel("frequency (Hz)")
     right.set_ylabel("damping (% of critical)")
     if numerical is not None and np.isfinite(numerical).any():
-        left.set_title(f"integrator's own error ≤ {np.nanmax(np.abs(numerical)):.1g} Hz", fontsize=8, color=GREY)
+        left.set_title(f"integrator's own error ≤ {engineering(float(np.nanmax(np.abs(numerical))), 'Hz', 2)}", fontsize=8, color=GREY)
     handles, labels = left.get_legend_handles_labels()
     extra = [(h, n) for h, n in zip(*right.get_legend_handles_labels(), strict=True) if n not in labels]
     legend_below(figure, handles + [h for h, _ in extra], labels + [n for _, n in extra])
