@@ -66,7 +66,10 @@ def test_a_band_that_holds_is_not_called_inadequate(coverage: float) -> None:
 
 
 def test_without_posterior_there_are_no_intervals_to_doubt() -> None:
-    assert not missed(result(0.04, posterior=False)) and "inadequate" not in told(result(0.04, posterior=False))
+    found = result(0.04, posterior=False)
+    assert not missed(found) and "inadequate" not in told(found)
+    assert "Next: add [posterior] to learn" in told(found)
+    assert "Next: add [posterior] and [prediction] to learn" in told({**found, "heldout": None})
 
 
 def test_refusals_keep_their_words() -> None:

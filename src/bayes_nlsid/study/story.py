@@ -200,5 +200,6 @@ def _next(result: Mapping[str, Any]) -> str:
     if b.get("inside_damping") is not None and min(b["inside_damping"], b["inside_frequency"]) < 0.6:
         return "Next: the measured backbone leaves the band; find what is missing with nlsid diagnose before extrapolating."
     if "parameters" in result and not any("identifiable" in p for p in result["parameters"]):
-        return "Next: add [posterior] and [prediction] to learn how sure these values are."
+        lacking = "[posterior]" if b or result.get("heldout") else "[posterior] and [prediction]"
+        return f"Next: add {lacking} to learn how sure these values are."
     return "Next: use the model within the amplitudes shown; a record at a larger amplitude would test it where it extrapolates."
