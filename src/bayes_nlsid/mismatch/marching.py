@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RINGING = 1.0   # second difference of a force over the force: 4 where it changes sign at every step
 HUGE = 1e100    # N; only a march that has lost its law gets there
-FINEST = 32     # steps per sample beyond which nothing is refined
+FINEST = 16     # steps per sample beyond which nothing is refined
 
 
 def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Complex | None = None, passes: int = 5
