@@ -8,6 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")  # before numpy: matrices of tests are small, and threads that wait for each other cost CPU time
+
 SHOWN = 15
 LEAST = 0.5  # s
 SPENT = pytest.StashKey[dict[str, float]]()

@@ -7,7 +7,7 @@ import re
 import sys
 import tomllib
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -80,6 +80,20 @@ def test_set_up_is_skipped_when_nothing_changed(start: ModuleType, tmp_path: Pat
     (tmp_path / "pyproject.toml").write_text("")
     start.set_up([changed])
     assert len(done) == 4
+
+
+def test_linear_algebra_gets_one_thread_unless_the_user_says_otherwise(start: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[dict[str, str]] = []
+
+    def run(command: list[str], **options: dict[str, str]) -> SimpleNamespace:
+        given.append(options["env"])
+        return SimpleNamespace(returncode=7)
+
+    monkeypatch.setattr(start.subprocess, "run", run)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert start.call(["-m", "bayes_nlsid"]) == 7
+    assert given[0]["OMP_NUM_THREADS"] == "3" and given[0]["OPENBLAS_NUM_THREADS"] == "1" and "PATH" in given[0]
 
 
 def test_a_folder_that_is_no_environment_is_left_alone(start: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
