@@ -29,6 +29,7 @@ from bayes_nlsid.mismatch.spectra import Spectra, repeats
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 FAINT, FAINT_CHARGE = 0.01, 20.0  # change of response below which a linear effect is charged, and how much
+FAINT_LEAK = 0.03  # the same of crosstalk: a sensor some millimetres off its place picks up its neighbour's motion too
 WEAKER = 4  # starts that are tried, each half as strong as the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
@@ -234,7 +235,8 @@ def hypothesis(bench: Bench, effects: tuple[Effect, ...], kinds: tuple[LinearKin
     """Put an estimate together; ``forces`` are the strengths of the effects that are forces, in their order."""
     free = sum(len(pack(e)) for e in effects if e.is_force) + len(fit.x) + sum(e.cls == "linear_stiffness" for e in effects)
     linear = _linear_strengths(bench, kinds, effects, fit)
-    faint = FAINT_CHARGE * np.maximum(np.log(FAINT / np.maximum(linear, 1e-9)), 0.0) ** 2
+    limits = np.array([FAINT_LEAK if k.other >= 0 else FAINT for k in kinds])
+    faint = FAINT_CHARGE * np.maximum(np.log(limits / np.maximum(linear, 1e-9)), 0.0) ** 2
     chosen = sum(k.other >= 0 for k in kinds) * np.log(max(len(bench.channels) - 1, 1))    # the leaking one, among all others
     charge = free * np.log(max(bench.evidence.H.size, 2)) + 2 * chosen + float(faint.sum())
     named, edges, strengths = [], 0, []
@@ -270,7 +272,7 @@ def force_strengths(bench: Bench, h: Complex, lines: Complex) -> Array:
 def _linear_strengths(bench: Bench, kinds: tuple[LinearKind, ...], effects: tuple[Effect, ...], fit: LinearFit) -> Array:
     """(kinds,): change of the transfer function by each linear effect, over the channel it belongs to or over all.
 
-    Those below one per cent are charged: they are what errors of the nominal model look like, and nobody would call them missing physics
+    Those below one per cent (three, of crosstalk) are charged: they are what errors of the nominal model look like, and nobody would call them missing physics
     without much evidence.
     """
     count = len(bench.channels)
