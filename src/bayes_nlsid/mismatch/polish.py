@@ -272,8 +272,8 @@ def force_strengths(bench: Bench, h: Complex, lines: Complex) -> Array:
 def _linear_strengths(bench: Bench, kinds: tuple[LinearKind, ...], effects: tuple[Effect, ...], fit: LinearFit) -> Array:
     """(kinds,): change of the transfer function by each linear effect, over the channel it belongs to or over all.
 
-    Those below one per cent (three, of crosstalk) are charged: they are what errors of the nominal model look like, and nobody would call them missing physics
-    without much evidence.
+    Those below one per cent (three, of crosstalk) are charged: they are what errors of the nominal model look like, and nobody would
+    call them missing physics without much evidence.
     """
     count = len(bench.channels)
     out, edge = [], 0
