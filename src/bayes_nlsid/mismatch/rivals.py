@@ -192,14 +192,15 @@ def _disturbed(found: list[Disturbance], rivals: list[Rival], case: Case) -> lis
     out = list(rivals)
     known = set(case.classes)
     strong = [d for d in found if d.gain > 25 and d.cls in known]
-    best = max(rivals, key=lambda r: r.gain) if rivals else None
+    # the best single, whatever a pair of coherent effects gains beside it
+    best = max((r for r in rivals if len(r.key) == 1), key=lambda r: r.gain, default=None)
     size = {d: _relative(case, d) for d in found}
     for d in found:
         if d.cls not in known or d.gain < (FAINT_PLACE if d.cls == "other" else FAINT):
             continue
         effect = Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",))
         out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effect,), (size[d],)))
-        if best is not None and d in strong and best.gain > 25 and len(best.key) == 1 and best.key[0] != (d.cls, d.place):
+        if best is not None and d in strong and best.gain > 25 and best.key[0] != (d.cls, d.place):
             key, sizes = _ordered([*best.key, (d.cls, d.place)], [*best.strengths, size[d]])
             out.append(Rival(key, best.gain + d.gain, max(best.gain, d.gain), best.hypothesis, best.clip, (*best.extra, effect), sizes))
     for i, a in enumerate(strong):
