@@ -271,16 +271,15 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
     spread = fam.error_sd if spread is None else spread
     sd = fam.prior_sd if prior_sd is None else prior_sd
     beside = np.zeros(0) if extension is None else 1 / extension.prior_sd ** 2
-    pull = np.zeros(0) if extension is None else beside * (x - extension.centre)
+    centre = np.zeros(0) if extension is None else extension.centre
     own = np.diag(np.concatenate([np.zeros(fam.size), beside]))
     system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
     before = np.inf
     for _ in range(rounds):
         spread = likeliest_shapes(system.B @ np.swapaxes(system.B, 1, 2), np.einsum("smk,sk->sm", system.B, system.r), spread, fam.error_sd)
-        sd = likeliest_groups(fam, theta, system.normal + own, system.gradient - np.concatenate([0 * theta, pull]), sd)
+        sd = likeliest_groups(fam, theta, system.normal + own, system.gradient - np.concatenate([0 * theta, beside * (x - centre)]), sd)
         theta, x, cost = descend(fam, theta, s, measured, variance, 2, prior_sd=sd, extension=extension, x=x, tol=0.1, spread=spread)
         system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
-        pull = np.zeros(0) if extension is None else beside * (x - extension.centre)
         cost += groups_price(fam, system.normal + own, sd)
         if before - cost < 1.0:
             break
@@ -292,7 +291,7 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
     model = with_shape_errors(fam, fld, s, errors)
     model = model if chain is None else chain.apply(model)
     misfit = float(np.sqrt((np.abs(measured - model) ** 2 / variance).sum() / (np.abs(measured) ** 2 / variance).sum()))
-    rest = system.gradient - np.concatenate([theta / sd ** 2, pull])
+    rest = system.gradient - np.concatenate([theta / sd ** 2, beside * (x - centre)])
     full = system.normal + np.diag(np.concatenate([1 / sd ** 2, beside]))
     return LinearFit(theta, x, fld, model, cost, system.chi2, 2 * measured.size, full, errors, spread, sd, s, measured, variance,
                      system, rest, misfit, status)

@@ -130,6 +130,11 @@ class Case:
         if self.sensor_rows.shape != (len(self.sensors), size):
             raise ValueError(f"sensor_rows has shape {self.sensor_rows.shape}, expected {(len(self.sensors), size)}")
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the usable sensors."""
+        return tuple(n for n, ok in zip(self.sensors, self.usable, strict=True) if ok)
+
     def select(self, kind: str, sealed: bool = False) -> tuple[CaseRecord, ...]:
         """Records of one kind, in the order of the test day."""
         return tuple(r for r in self.records if r.kind == kind and r.sealed == sealed)

@@ -74,7 +74,7 @@ def fit_clipping(fam: Family, evidence: Evidence, fit: LinearFit, channel: int, 
     theta, _, _ = descend(fam, fit.theta, s, evidence.H, blind, 8, prior_sd=fit.sd, spread=fit.spread)
     now = finish(fam, theta, s, evidence.H, blind, prior_sd=fit.sd, spread=fit.spread, rounds=0)
     for turn in range(3):
-        cost, best = min((undo(evidence, now, channel, float(x)).chi2, float(x)) for x in grid)
+        best = min((undo(evidence, now, channel, float(x)).chi2, float(x)) for x in grid)[1]
         cleaned = undo(evidence, now, channel, best)
         theta, _, _ = descend(fam, now.theta, s, cleaned.H, variance, 6, prior_sd=fit.sd, spread=fit.spread)
         now = finish(fam, theta, s, cleaned.H, variance, prior_sd=fit.sd, spread=fit.spread, rounds=6 if turn == 2 else 0)

@@ -134,12 +134,11 @@ def _groups(case: Case, notes: list[str]) -> tuple[Spectra, tuple[CaseRecord, ..
 
 
 def _bench(case: Case, fam: Family, fit: LinearFit, evidence: Evidence) -> Bench:
-    names = tuple(n for n, ok in zip(case.sensors, case.usable, strict=True) if ok)
     K = fam.K_parts.sum(0) + fam.K_rest
     stiffness = {k: 1 / max(float(v @ np.linalg.solve(K, v)), 1e-30) for k, v in fam.places.items()}
     rows = np.array(list(fam.places.values())) if fam.places else np.zeros((0, len(K)))
     scale = sizes(bed(fit.fields.modes, evidence.spectra, rows, fam.shaker), list(fam.places)) if len(rows) else {}
-    return Bench(fam, evidence, names, _mass_scale(case), stiffness, scale)
+    return Bench(fam, evidence, case.channels, _mass_scale(case), stiffness, scale)
 
 
 def _one_level(fam: Family, evidence: Evidence) -> tuple[LinearFit, ...]:

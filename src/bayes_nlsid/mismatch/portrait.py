@@ -128,7 +128,7 @@ def _held(analysis: Analysis, proof: Proof) -> Numbers:
     half = proof.bands.factor * proof.bands.sd(waves["extended"], case.rate)
     out["heldout_half"] = half[piece].astype(np.float32)
     out["heldout_time"] = np.arange(n)[piece] / case.rate
-    out["heldout_channels"] = np.array([c for c, ok in zip(case.sensors, case.usable, strict=True) if ok])
+    out["heldout_channels"] = np.array(case.channels)
     out["heldout_units"] = np.array(["m/s^2"] * waves["measured"].shape[1])
     out["heldout_name"] = np.array(proof.records[0])
     return out
@@ -243,7 +243,7 @@ def _number(name: str) -> float:
 
 def _chains(analysis: Analysis, h: Hypothesis) -> Numbers:
     """For every fault of the measuring chain: measured over modelled transfer function with the fault taken out of the model."""
-    fit, names = h.fit, [n for n, ok in zip(analysis.case.sensors, analysis.case.usable, strict=True) if ok]
+    fit, names = h.fit, analysis.case.channels
     count, kinds, edge, shown = len(names), list(h.kinds), 0, 0
     out: Numbers = {}
     for e in h.effects:
@@ -308,7 +308,7 @@ def _clipped(analysis: Analysis, best: Rival, h: Hypothesis | None) -> Numbers:
     fit = analysis.fit if h is None else h.fit
     wave, _ = Predictor(analysis.family, fit, h, int(case.usable.sum()), (), analysis.evidence.spectra).run(case, record)
     at = int(np.argmax(np.abs(wave[:, channel])))
-    names = [n for n, ok in zip(case.sensors, case.usable, strict=True) if ok]
+    names = case.channels
     first = int(np.clip(at - 100, 0, max(len(wave) - 200, 0)))
     piece = slice(first, first + 200)
     return {"clip_time": record.time[piece], "clip_measured": record.accel[piece][:, case.usable][:, channel],
@@ -326,7 +326,7 @@ def _quiet(case: Case, best: Rival) -> Numbers:
 
     accel = offs[0].accel[:, case.usable]
     f, power = welch(accel, case.rate, nperseg=min(len(accel), int(case.rate)), axis=0, detrend="constant")
-    names = [n for n, ok in zip(case.sensors, case.usable, strict=True) if ok]
+    names = case.channels
     own = [names.index(places[0])] if places[0] in names else list(range(len(names)))
     others = [i for i in range(len(names)) if i not in own]
     out: Numbers = {"quiet_frequency": f, "quiet_own": np.sqrt(power[:, own].mean(1)), "quiet_place": np.array(places[0]),
