@@ -61,7 +61,8 @@ def test_refusals(arguments: list[str], status: int, words: str, tmp_path: Path,
 
 
 @pytest.mark.parametrize("arguments", [["run"], ["run", "s.toml"], ["flurb"], ["terms", "--seed", "-1"], ["terms", "--workers", "0"],
-                                       ["terms", "--executor", "cloud"], ["terms", "--executor", "dask://a"], ["--nonsense"]])
+                                       ["terms", "--executor", "cloud"], ["terms", "--executor", "dask://a"], ["--nonsense"],
+                                       ["run", "s.toml", "--out", ""], ["report", ""], ["new", ""]])
 def test_wrong_usage_is_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
@@ -111,7 +112,25 @@ def test_nothing_but_the_summary_without_a_terminal(tmp_path: Path, capsys: pyte
     assert "[1/3] read" in (tmp_path / "more.log").read_text()
     assert main(["run", str(study), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr() == ("", "")
-    assert main(["run", str(study), "--out", str(tmp_path / "out"), "--log", str(tmp_path / "no" / "x.log")]) == 2
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["run", "STUDY", "--out", "file/x"], "file/x: cannot be made"), (["run", "STUDY", "--out", "file"], "the output folder is a file"),
+    (["diagnose", "STUDY", "--out", "file/x"], "file/x: cannot be made"), (["report", "file/x"], "there is no such folder"),
+    (["run", "STUDY", "--out", "x", "--log", "no/x.log"], "--log no/x.log: cannot be written to"),
+    (["run", "STUDY", "--out", "x", "--log", "."], "--log .: cannot be written to"),
+])
+def test_folders_that_cannot_be_written(arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                        capsys: pytest.CaptureFixture[str]) -> None:
+    from bayes_nlsid.study.template import write_template
+
+    monkeypatch.chdir(tmp_path)
+    study = write_template(tmp_path / "s")
+    (tmp_path / "file").write_text("in the way")
+    assert main([str(study) if a == "STUDY" else a for a in arguments]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and words in said.err and said.err.startswith("nlsid"), said.err
+    assert (tmp_path / "file").read_text() == "in the way" and not (tmp_path / "x").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX pipes")

@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".", parents=[common])
         parser.set_defaults(action=action, command=name)
         if out:
-            parser.add_argument("--out", required=True, metavar="DIR", help="results folder")
+            parser.add_argument("--out", required=True, type=_named, metavar="DIR", help="results folder")
         return parser
 
     run = add("run", "all stages of a study, resuming where an earlier run stopped", _run, out=True)
@@ -78,12 +78,12 @@ def _parser() -> argparse.ArgumentParser:
     add("plan", "before a test: which sensors, place and level of excitation let the joints be learned, and what cannot be", _plan,
         out=True).add_argument("study", metavar="STUDY.toml")
     report = add("report", "write report.html again from stored results", _report)
-    report.add_argument("out", metavar="DIR")
+    report.add_argument("out", type=_named, metavar="DIR")
     report.add_argument("--format", choices=("html", "markdown"), default="html", help="markdown also writes report.md")
     add("terms", "the library of force laws as a table", _terms)
     add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses)
     new = add("new", "write a commented study to start from", _new)
-    new.add_argument("out", metavar="DIR")
+    new.add_argument("out", type=_named, metavar="DIR")
     new.add_argument("--from", dest="files", nargs="+", metavar="FILE", default=[],
                      help="recordings, matrices, locations and modal results to write the study from; guesses are commented")
     return top
@@ -98,6 +98,13 @@ def _common() -> _Parser:
     group.add_argument("--quiet", action="store_true", help="no progress, no summary")
     group.add_argument("--log", metavar="FILE", help="also write the log here")
     return common
+
+
+def _named(text: str) -> str:
+    """An empty name, as an unset variable of a shell leaves it, would mean the present folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the name of the folder is empty")
+    return text
 
 
 def _whole(text: str) -> int:
@@ -130,8 +137,11 @@ def _reporter(options: argparse.Namespace, out: Path | None) -> Any:
     logs = [] if out is None else [out / "run.log"]
     if options.log:
         extra = Path(options.log)
-        if not extra.parent.is_dir():
-            raise InputError(f"--log {options.log}", f"there is no folder {extra.parent}", "create it or choose another file")
+        try:
+            extra.open("a", encoding="utf-8").close()
+        except OSError as error:
+            raise InputError(f"--log {options.log}", f"cannot be written to ({error.strerror})",
+                             "create its folder or choose another file") from None
         logs.append(extra)
     return Reporter(tuple(logs), terminal)
 

@@ -106,10 +106,17 @@ def test_everything_else_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("params", [{"q": ("N", "coefficient")}, {"abs": ("N", "coefficient")}, {"c d": ("N", "coefficient")},
                                     {"c": "N"}, {"c": ("N",)}, {"c": ("N", "anything")}, {"c": ("N", "range", 2, 1)},
-                                    {"c": ("N", "range", "a", 1)}, {"c": ("N", "coefficient"), "idle": ("", "coefficient")}])
+                                    {"c": ("N", "range", "a", 1)}, {"c": ("N", "coefficient"), "idle": ("", "coefficient")},
+                                    {"c": ("furlong", "coefficient")}, {"c": ("kN/mm", "coefficient")}, {"c": ("N", "stiffness")},
+                                    {"c": ("N/m", "force")}, {"c": ("N", ["force"])}])
 def test_parameters_are_checked(params: dict) -> None:
     with pytest.raises(InputError, match="study.toml: .terms. x"):
         user_term("x", "c*q", params, where="study.toml: [terms] x")
+
+
+@pytest.mark.parametrize("unit", ["", "N/m^3", "N s^2/m^2", "N·s/m", "N m/rad", "N^(1-c)/m", "1/s", "kg"])
+def test_units_without_prefix_are_taken_as_written(unit: str) -> None:
+    assert user_term("x", "c*q**3", {"c": (unit, "coefficient")}).params[0].unit == unit
 
 
 @pytest.mark.parametrize(("text", "memory"), [("c*v", "masing"), ("c*q**2", "masing"), ("c*q", "sliders")])

@@ -52,6 +52,16 @@ CASES = {
     "amplitude in hertz": ('amplitude = "2 mm"', 'amplitude = "2 Hz"', ["[prediction] amplitude", "Hz"]),
     "held out unknown": ('heldout = ["later part"]', 'heldout = ["last part"]', ["heldout", "no recording 'last part'", "'later part'"]),
     "held out but fitted": ('heldout = ["later part"]', 'heldout = ["multisine"]', ["heldout", "'multisine' has role = 'train'", "fitted"]),
+    "held out twice": ('heldout = ["later part"]', 'heldout = ["later part", "later part"]', ["[prediction] heldout", "names repeat"]),
+    "held out in part fitted": ("window = [8.0, 12.0]", "window = [7.0, 12.0]",
+                                ["[[recordings]] 2 window", "'later part' is kept for judging, but 7 to 8 s of it is fitted in"]),
+    "held out of a whole file": ("window = [0.0, 8.0]", "", ["[[recordings]] 2 window", "8 to 12 s of it is fitted"]),
+    "band without the mode": ('band = ["5 Hz", "80 Hz"]', 'band = ["50 Hz", "80 Hz"]',
+                              ["[identification] band", "leaves out mode 1 at 20 Hz"]),
+    "amplitude below zero": ('amplitude = "2 mm"', 'amplitude = "2 mm"\namplitudes = [0.001, -0.5]',
+                             ["[prediction] amplitudes", "ascending"]),
+    "amplitude out of reach": ('amplitude = "2 mm"', 'amplitude = "2 mm"\namplitudes = ["1 mm", "3 mm"]',
+                               ["[prediction] amplitudes", "0.003 m lies above amplitude = 0.002 m"]),
     "held out of a quiet record": ('heldout = ["later part"]', 'heldout = ["quiet"]', ["heldout", "'quiet'", "excitation off"]),
     "backbone of a quiet record": ('heldout = ["later part"]', 'measured = "quiet"', ["measured", "'quiet'", "name a free decay"]),
     "mode of the backbone": ("mode = 1\n", "mode = 3\n", ["[prediction] mode", "mode 3 does not exist, the model has 1"]),
@@ -71,6 +81,10 @@ CASES = {
     "own term of a taken name": ("[posterior]", '[[terms]]\nname = "cubic"\nformula = "c*q"\nparams = { c = ["N/m", "coefficient"] '
                                                 '}\n[posterior]',
                                  ["[[terms]] 1 name", "already a term"]),
+    "own unit with a prefix": ("[posterior]", '[[terms]]\nname = "m"\nformula = "c*q"\nparams = { c = ["N/mm", "coefficient"] }\n'
+                               "[posterior]", ["[[terms]] 1 term 'm', parameter 'c'", "'mm', which is no SI unit", "N/m^3"]),
+    "own unit against its rule": ("[posterior]", '[[terms]]\nname = "m"\nformula = "c*q"\nparams = { c = ["N", "stiffness"] }\n'
+                                  "[posterior]", ["parameter 'c'", "'N' does not go with the rule 'stiffness'", "write N/m"]),
     "own parameter misread": ("[posterior]", '[[terms]]\nname = "m"\nformula = "c*q"\nparams = { c = "N/m" }\n[posterior]',
                               ["params", "c"]),
 }

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
@@ -233,6 +234,11 @@ def _function(name: str, arguments: list[Dual]) -> Dual:
     return value, _times(rate, a[1]), _times(rate, a[2])
 
 
+SYMBOLS = frozenset({"N", "m", "s", "kg", "rad", "Hz", "V"})
+"""What units of a formula's parameters are made of; prefixes would contradict the values, which are SI."""
+UNITS_OF_RULES = {"stiffness": ("N/m", "N m/rad"), "force": ("N", "N m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
+
+
 def user_term(name: str, formula: str, params: Mapping[str, Sequence[Any]], memory: Literal["none", "masing"] = "none", *,
               meaning: str = "", where: str = "") -> Term:
     """A term from a formula.
@@ -285,8 +291,17 @@ def _param(name: str, entry: Sequence[Any], place: str) -> Param:
         raise InputError(where, "the name cannot be used in a formula", "use letters, digits and _, and none of q, v, pi or a function")
     if isinstance(entry, str) or len(entry) not in (2, 4):
         raise InputError(where, f"{entry!r} is not (unit, rule) or (unit, rule, lower, upper)", "give the unit and the rule for its bounds")
+    unit, rule = str(entry[0]).strip(), entry[1]
+    written = re.sub(r"\^\([^)]*\)", "", unit)  # an exponent may hold a parameter's name
+    foreign = [word for word in re.findall(r"[^\W\d_]+", written) if word not in SYMBOLS]
+    if foreign:
+        raise InputError(where, f"unit {unit!r} holds {foreign[0]!r}, which is no SI unit without prefix",
+                         f"write it with {', '.join(sorted(SYMBOLS))}, for instance N/m^3, or empty for a plain number")
+    expected = UNITS_OF_RULES.get(str(rule), (unit,))
+    if unit not in expected:
+        raise InputError(where, f"unit {unit!r} does not go with the rule {rule!r}", f"write {' or '.join(expected)}")
     try:
-        plain = Param(name, str(entry[0]), entry[1])
+        plain = Param(name, unit, rule)
         return replace(plain, lower=float(entry[2]), upper=float(entry[3])) if len(entry) == 4 else plain
     except (TypeError, ValueError) as error:
         raise InputError(where, str(error), "use a rule of the table of parameters, and lower < upper") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
+from math import inf
 from typing import Any
 
 from bayes_nlsid.errors import InputError
@@ -34,6 +35,7 @@ def check_consistency(study: Study, built: Structure | ModalModel) -> None:
     _check_modes(study, built, where)
     _check_parts(study, built, where)
     _check_roles(study, where)
+    _check_windows(study, where)
     _check_priors(study, where)
 
 
@@ -50,9 +52,32 @@ def _check_modes(study: Study, built: Structure | ModalModel, where: str) -> Non
         if beyond:
             mend = "name lower ones" if isinstance(built, ModalModel) else "raise modes in [reduction], or name lower ones"
             raise InputError(f"{where}: [{table}] {key}", f"mode {beyond[0]} does not exist, the model has {count}", mend)
+    if study.identification is not None and isinstance(built, ModalModel):
+        refuse_band(study, float(built.frequency[study.identification.main - 1]))
     if len(study.linear.damping) > count:
         raise InputError(f"{where}: [linear] damping", f"{len(study.linear.damping)} ratios are given for {count} mode{'s'[:count > 1]}",
                          "give fewer")
+
+
+def refuse_band(study: Study, frequency: float) -> None:
+    """The residual is that of the main mode's equation, so its band must hold the main mode.
+
+    Parameters
+    ----------
+    study : Study
+    frequency : float
+        Of the main mode, Hz.
+
+    Raises
+    ------
+    InputError
+        If a stated band leaves it out.
+    """
+    entry = study.identification
+    if entry is not None and entry.band is not None and not entry.band[0] < frequency < entry.band[1]:
+        raise InputError(f"{study.file.name}: [identification] band",
+                         f"{entry.band[0]:g} to {entry.band[1]:g} Hz leaves out mode {entry.main} at {frequency:.4g} Hz, the main one",
+                         "widen the band, or name another main mode")
 
 
 def _check_parts(study: Study, built: Structure | ModalModel, where: str) -> None:
@@ -96,6 +121,25 @@ def _check_roles(study: Study, where: str) -> None:
         if prediction.at not in sensors:
             raise InputError(f"{where}: [prediction] measured", f"recording {found.name!r} has no channel at {prediction.at!r}",
                              f"choose at among {', '.join(sensors)}")
+
+
+def _check_windows(study: Study, where: str) -> None:
+    """What judges must not hold samples that are fitted: windows of the same signals of one file must not overlap."""
+    judges = study.prediction.heldout if study.prediction is not None else ()
+    for number, kept in enumerate(study.recordings, start=1):
+        if kept.role != "holdout" and kept.name not in judges:
+            continue
+        signals = {(c.array, c.column) for c in kept.channels if c.quantity != "force"}
+        for fitted in study.recordings:
+            shared = signals & {(c.array, c.column) for c in fitted.channels if c.quantity != "force"}
+            if fitted.role != "train" or fitted is kept or fitted.file != kept.file or not shared:
+                continue
+            low, high = (edge(a, b) for edge, a, b in zip((max, min), kept.window or (0.0, inf), fitted.window or (0.0, inf), strict=True))
+            if low < high:
+                part = f"{low:g} to {high:g} s" if high < inf else f"all that follows {low:g} s"
+                raise InputError(f"{where}: [[recordings]] {number} window",
+                                 f"{kept.name!r} is kept for judging, but {part} of it is fitted in {fitted.name!r}",
+                                 "move one of the windows, so that nothing judges what it was fitted to")
 
 
 def _check_priors(study: Study, where: str) -> None:

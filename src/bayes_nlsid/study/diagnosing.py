@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bayes_nlsid.errors import InputError
 from bayes_nlsid.mismatch.diagnose import diagnose
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, write_diagnosis
 from bayes_nlsid.study.diagnosis_page import effects_of, page
@@ -12,7 +11,7 @@ from bayes_nlsid.study.diagnosis_pictures import pictures
 from bayes_nlsid.study.lock import held
 from bayes_nlsid.study.progress import Reporter
 from bayes_nlsid.study.sketch import sketch_of
-from bayes_nlsid.study.store import write_atomic, writing
+from bayes_nlsid.study.store import make_folder, write_atomic, writing
 
 
 def run_diagnosis(path: Path | str, out: Path | str, *, seed: int | None = None, reporter: Reporter | None = None) -> Diagnosis:
@@ -24,13 +23,8 @@ def run_diagnosis(path: Path | str, out: Path | str, *, seed: int | None = None,
         If the case cannot be used, or ``out`` cannot be written.
     """
     case, folder = Path(path), Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(str(folder), "the output folder is a file", "choose another --out")
-    try:
-        (folder / "figures").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(str(folder), f"cannot be made ({error.strerror})", "choose another --out") from None
-    with writing(folder), held(folder / "figures" / "lock"):
+    figures = make_folder(folder, "figures")
+    with writing(folder), held(figures / "lock"):
         return _carry_out(case, folder, seed, reporter)
 
 

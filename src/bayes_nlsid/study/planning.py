@@ -18,7 +18,7 @@ from bayes_nlsid.study.axes import brief_names, engineering
 from bayes_nlsid.study.building import build_element, build_structure, library, reduce_structure
 from bayes_nlsid.study.lock import held
 from bayes_nlsid.study.schema import ElementEntry, PlanEntry, Study
-from bayes_nlsid.study.store import versions, write_atomic, writing
+from bayes_nlsid.study.store import make_folder, versions, write_atomic, writing
 
 SENSORS = 12  # rows of tables
 EXCITATIONS = 12
@@ -48,18 +48,15 @@ def run_plan(study: Study, out: Path, *, seed: int | None = None, progress: Call
         raise InputError(f"{study.file.name}: [plan]", "is missing",
                          "add [plan] with sensors, inputs, band, levels, noise and [[plan.joints]]")
     number = study.seed if seed is None else seed
-    if out.exists() and not out.is_dir():
-        raise InputError(str(out), "the output folder is a file", "choose another --out")
-    with writing(out):
-        (out / "figures").mkdir(parents=True, exist_ok=True)
-        with held(out / "figures" / "lock"):
-            found = _compute(study, entry, number, progress)
-            said = record(found, study.title, number)
-            write_atomic(out / "plan.json", (json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
-            pictures = _pictures(found, said)
-            for name, (image, _) in pictures.items():
-                write_atomic(out / "figures" / f"{name}.png", image)
-            write_atomic(out / "plan.html", _page(said, pictures, entry, dict(study.inputs)).encode())
+    figures = make_folder(out, "figures")
+    with writing(out), held(figures / "lock"):
+        found = _compute(study, entry, number, progress)
+        said = record(found, study.title, number)
+        write_atomic(out / "plan.json", (json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+        pictures = _pictures(found, said)
+        for name, (image, _) in pictures.items():
+            write_atomic(figures / f"{name}.png", image)
+        write_atomic(out / "plan.html", _page(said, pictures, entry, dict(study.inputs)).encode())
     return said
 
 

@@ -1,9 +1,10 @@
-"""The tables of a study file for the commands beside the run: ``[frf]`` and ``[montecarlo]``."""
+"""The tables of a study file for the commands beside the run: ``[frf]``, ``[montecarlo]`` and ``[compare]``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from bayes_nlsid.study.reading_method import read_amplitudes
 from bayes_nlsid.study.schema import CompareEntry, FrfEntry, MonteCarloEntry, PredictionEntry, SpreadEntry
 from bayes_nlsid.study.table import Table, nearest
 
@@ -61,9 +62,7 @@ def read_montecarlo(table: Table | None, locations: Sequence[str], prediction: P
     at = _location(table, "at", locations) if prediction is None or table.has("at") else prediction.at
     amplitude = table.number("amplitude", "length", *(() if prediction is None else (prediction.amplitude,)), positive=True)
     mode = table.integer("mode", 1 if prediction is None else prediction.mode, low=1)
-    amplitudes = table.numbers("amplitudes", "length", () if prediction is None or table.has("amplitude") else prediction.amplitudes)
-    if list(amplitudes) != sorted(set(amplitudes)) or any(a <= 0 for a in amplitudes):
-        raise table.wrong("amplitudes", f"{list(amplitudes)} are not positive and ascending", 'write amplitudes = ["0.1 mm", "1 mm"]')
+    amplitudes = read_amplitudes(table, amplitude, () if prediction is None or table.has("amplitude") else prediction.amplitudes)
     entry = MonteCarloEntry(source, at, amplitude, mode, amplitudes, tuple(spreads),
                             table.integer("samples", 1000, low=16, high=MOST_SAMPLES),
                             table.flag("indices", True), table.text("path", "auto", ("auto", "fast", "time")))

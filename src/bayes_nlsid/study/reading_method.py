@@ -237,14 +237,30 @@ def read_prediction(table: Table | None, locations: Sequence[str], recordings: S
         for name in names:
             if name not in recordings:
                 raise table.wrong(key, f"there is no recording {name!r}", nearest(name, recordings))
+    if len(set(heldout)) != len(heldout):
+        raise table.wrong("heldout", f"names repeat: {list(heldout)}", "name each once")
+    amplitude = table.number("amplitude", "length", positive=True)
     entry = PredictionEntry(
-        at, table.number("amplitude", "length", positive=True), table.integer("mode", 1, low=1), table.integer("samples", 100, low=2),
+        at, amplitude, table.integer("mode", 1, low=1), table.integer("samples", 100, low=2),
         table.number("seconds", "time", None, positive=True), table.number("fs", "frequency", None, positive=True),
-        table.text("scheme", "hht", ("hht", "exponential")), table.numbers("amplitudes", "length", ()), table.text("measured", None),
+        table.text("scheme", "hht", ("hht", "exponential")), read_amplitudes(table, amplitude), table.text("measured", None),
         table.span("band", "frequency", None), heldout, table.integer("draws", 100, low=2),
         table.text("score", "band", ("band", "all")), table.number("tolerance", "ratio", None, positive=True))
     table.close()
     return entry
+
+
+def read_amplitudes(table: Table, start: float, default: tuple[float, ...] = ()) -> tuple[float, ...]:
+    """``amplitudes`` (m) at which a decay from ``start`` (m) is read: above zero, ascending, none above the start."""
+    if not table.has("amplitudes"):
+        return default
+    values: tuple[float, ...] = table.numbers("amplitudes", "length")
+    if list(values) != sorted(set(values)) or any(a <= 0 for a in values):
+        raise table.wrong("amplitudes", f"{list(values)} are not positive and ascending", 'write amplitudes = ["0.1 mm", "1 mm"]')
+    if values and values[-1] > start:
+        raise table.wrong("amplitudes", f"{values[-1]:g} m lies above amplitude = {start:g} m, from where the motion decays",
+                          "raise amplitude, or leave the larger ones out")
+    return values
 
 
 def read_report(table: Table | None) -> ReportEntry:

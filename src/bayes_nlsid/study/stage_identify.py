@@ -19,6 +19,7 @@ from bayes_nlsid.recordings.kinematics import kinematics
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 from bayes_nlsid.structure.sensing import modal_data
 from bayes_nlsid.study.building import build_element, element_from, element_record
+from bayes_nlsid.study.consistency import refuse_band
 from bayes_nlsid.study.context import Arrays, Context, Result
 from bayes_nlsid.study.schema import AlternativeEntry, IdentificationEntry
 
@@ -60,6 +61,7 @@ def observed(context: Context, role: str = "train") -> tuple[ModalData, ...]:
         raise InputError(f"{context.study.file.name}: [identification] modes",
                          f"mode {unknown[0]} does not exist, the model has {model.modes}",
                          "raise modes in [reduction], or name lower ones")
+    refuse_band(context.study, float(model.frequency[entry.main - 1]))
     chosen = chosen_scenario(context)
     places = tuple(dict.fromkeys([*entry.joints, *(place for e in _all_elements(entry) for place in e.locations)]))
     try:

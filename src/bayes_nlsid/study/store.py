@@ -105,6 +105,26 @@ def writing(where: Path) -> Iterator[None]:
         raise
 
 
+def make_folder(out: Path, inner: str) -> Path:
+    """The folder ``inner`` of a results folder, both made where they are missing.
+
+    Raises
+    ------
+    InputError
+        If a file stands in the way, or the folder cannot be made or written to.
+    """
+    with writing(out):
+        try:
+            if out.exists() and not out.is_dir():
+                raise InputError(str(out), "the output folder is a file", "choose another --out")
+            (out / inner).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            if isinstance(error, PermissionError) or error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+                raise
+            raise InputError(str(out), f"cannot be made ({error.strerror})", "choose another --out") from None
+    return out / inner
+
+
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old one or the new one, never half of it.
 
@@ -148,17 +168,14 @@ class Store:
         self.out = Path(out)
         self.stages = self.out / "stages"
         self._mark = self.stages / "store.json"
-        if self.out.exists() and not self.out.is_dir():
-            raise InputError(str(self.out), "the output folder is a file", "choose another --out")
-        if not self._mark.exists():
+        if self.out.is_dir() and not self._mark.exists():
             foreign = [name for name in ("result.json", "stages", "report.html", "posterior.nc") if (self.out / name).exists()]
             if foreign and not self._ours_half_made():
                 raise InputError(str(self.out), f"holds {', '.join(foreign)} that this program did not make",
                                  "choose another --out, or move them away")
-        with writing(self.out):
-            self.stages.mkdir(parents=True, exist_ok=True)
-            if not self._mark.exists():
-                write_atomic(self._mark, json.dumps({"made_by": "bayes_nlsid", "format": FORMAT}).encode())
+        make_folder(self.out, "stages")
+        if not self._mark.exists():
+            write_atomic(self._mark, json.dumps({"made_by": "bayes_nlsid", "format": FORMAT}).encode())
         self._check_format()
 
     def _ours_half_made(self) -> bool:
