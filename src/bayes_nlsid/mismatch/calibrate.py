@@ -23,6 +23,7 @@ from bayes_nlsid.mismatch.shapes import shape_columns, with_shape_errors
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RELATIVE_FLOOR = 2e-4  # of any model of this kind
+LONGEST = 1.5  # step of any parameter
 
 
 @final
@@ -150,7 +151,7 @@ class System:
         """(S, m): best shape errors."""
         return np.asarray(np.linalg.solve(self.C, np.einsum("smk,sk->sm", self.B, self.r)[..., None])[..., 0])
 
-    def gains(self, columns: Complex, full: Array, rest: Array) -> tuple[Array, Array]:
+    def gains(self, columns: Complex, full: Array, rest: Array) -> tuple[Array, Array, Array]:
         """What one more column would explain, everything else projected out.
 
         Parameters
@@ -160,7 +161,7 @@ class System:
 
         Returns
         -------
-        gain (C,) decrease of cost, value (C,) of the coefficient
+        gain (C,) decrease of cost, value (C,) of the coefficient, moves (C, P) of the parameters that go with it
         """
         c = np.moveaxis(stack(columns, self.root), 1, 0)                            # (S, C, 2L)
         Bc = self.B @ np.swapaxes(c, 1, 2)                                         # (S, m, C)
@@ -173,7 +174,8 @@ class System:
         solved = np.linalg.solve(full, cross)
         information = np.maximum(own - (cross * solved).sum(0), 1e-12 * own + 1e-300)
         slope = slope - rest @ solved
-        return np.asarray(slope ** 2 / information), np.asarray(slope / information)
+        value = slope / information
+        return np.asarray(slope ** 2 / information), np.asarray(value), np.asarray(np.linalg.solve(full, rest) - (solved * value).T)
 
 
 def stack(values: Complex, root: Array) -> Array:
@@ -226,6 +228,57 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
     return System(normal, gradient, chi2, root, Br, Jr, C, r)
 
 
+@final
+@dataclass(frozen=True)
+class Place:
+    """Parameters ``y`` (P,) with the normal matrix (P, P) of the cost there, the gradient (P,) of −cost/2, and the cost."""
+
+    y: Array
+    normal: Array
+    gradient: Array
+    cost: float
+
+    @property
+    def step(self) -> Array:
+        """(P,) of Gauss and Newton."""
+        return np.asarray(np.linalg.solve(self.normal, self.gradient))
+
+    @property
+    def promise(self) -> float:
+        """Decrease of the cost that a full step promises."""
+        return float(self.gradient @ self.step)
+
+
+def _ahead(at: Callable[[Array], Place], here: Place, turns: int = 4) -> Place | None:
+    """Where full steps lead within some ``turns``, the cost above what it was in between; None if they do not lead below it.
+
+    Sharp resonances make the valleys of the cost narrow and bent: a step along a valley leaves it by its own square, which the next
+    step mends. Steps so short that every one of them stays inside would need hundreds (cf. the watchdog of Chamberlain et al. 1982).
+    """
+    there = here
+    for _ in range(turns):
+        step = there.step
+        if not np.abs(step).max(initial=0.0) < LONGEST:
+            return None
+        there = at(there.y + step)
+        if there.cost < here.cost:
+            return there
+        if not there.promise > 0.5 * (there.cost - here.cost):
+            return None
+    return None
+
+
+def _damped(at: Callable[..., Place], here: Place, damping: float) -> tuple[Place | None, float]:
+    """The first damped step that lowers the cost (None if there is no such step), and the damping for the next."""
+    for _ in range(6):
+        step = np.linalg.solve(here.normal + damping * np.diag(np.diag(here.normal)), here.gradient)
+        trial = here.y + np.clip(step, -LONGEST, LONGEST)
+        if at(trial, False).cost < here.cost:
+            return at(trial), max(damping / 6, 1e-9)
+        damping = max(damping * 8, 1e-4)
+    return None, damping
+
+
 def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, steps: int, *, prior_sd: Array | None = None,
             extension: Extension | None = None, x: Array | None = None, log: bool = False, tol: float = 1e-3, spread: Array | None = None
             ) -> tuple[Array, Array, float]:
@@ -237,29 +290,26 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
     if extension is not None:
         prior = np.concatenate([prior, 1 / extension.prior_sd ** 2])
         centre = np.concatenate([centre, extension.centre])
-    y = np.concatenate([theta, x])
-    system = assemble(fam, theta, x, s, measured, variance, extension, log, spread=spread)
-    cost = system.chi2 + float(prior @ (y - centre) ** 2)
-    damping = 1e-3
+
+    def at(y: Array, derivatives: bool = True) -> Place:
+        system = assemble(fam, y[:count], y[count:], s, measured, variance, extension, log, derivatives, spread)
+        normal, gradient = system.normal, system.gradient
+        if derivatives:
+            normal, gradient = normal + np.diag(prior), gradient - prior * (y - centre)
+        return Place(y, normal, gradient, system.chi2 + float(prior @ (y - centre) ** 2))
+
+    here, damping = at(np.concatenate([theta, x])), 1e-3
     for _ in range(steps):
-        normal, gradient = system.normal + np.diag(prior), system.gradient - prior * (y - centre)
-        accepted = False
-        for _ in range(6):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            trial = y + np.clip(step, -1.5, 1.5)
-            new = assemble(fam, trial[:count], trial[count:], s, measured, variance, extension, log, derivatives=False, spread=spread).chi2
-            new += float(prior @ (trial - centre) ** 2)
-            if np.isfinite(new) and new < cost:
-                accepted = True
-                break
-            damping = max(damping * 8, 1e-4)
-        if not accepted:
+        # along a valley each damped step gains little: what is left to gain decides, not what the last step gained
+        if here.promise < tol * max(1.0, 1e-3 * here.cost):
             break
-        gain, y, damping = cost - new, trial, max(damping / 6, 1e-9)
-        cost = new
-        if gain < tol * max(1.0, 1e-3 * cost):
+        ahead = _ahead(at, here)
+        if ahead is None:
+            ahead, damping = _damped(at, here, damping)
+        if ahead is None:
             break
-        system = assemble(fam, y[:count], y[count:], s, measured, variance, extension, log, spread=spread)
+        here = ahead
+    y, cost = here.y, here.cost
     return y[:count], y[count:], cost
 
 

@@ -8,7 +8,7 @@ the joint estimation in ``polish``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -33,7 +33,8 @@ Complex = NDArray[np.complex128]
 class Candidate:
     """An effect with the decrease of −2 log likelihood that one regression promises.
 
-    ``start`` carries the coefficient (in search units) and ``frequency`` (Hz) of a linear effect; ``other`` a leaking channel.
+    ``start`` carries the coefficient (in search units) and ``frequency`` (Hz) of a linear effect; ``other`` a leaking channel; ``moves``
+    (P + X,) how the parameters of the linear fit that it was found by move with it.
     """
 
     effect: Effect
@@ -41,6 +42,7 @@ class Candidate:
     start: float = 0.0
     frequency: float = 0.0
     other: int = -1
+    moves: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @final
@@ -216,12 +218,12 @@ def scan_linear(fam: Family, fit: LinearFit, names: tuple[str, ...], mass: float
 
     def judge(columns: Complex, effects: list[Effect], positive: bool, frequencies: Array | None = None, other: list[int] | None = None
               ) -> None:
-        gains, values = system.gains(columns, full, fit.rest)
+        gains, values, moves = system.gains(columns, full, fit.rest)
         for i, effect in enumerate(effects):
             if positive and values[i] <= 0:
                 continue
             out.append(Candidate(effect, float(gains[i]), float(values[i]), 0.0 if frequencies is None else float(frequencies[i]),
-                                 -1 if other is None else other[i]))
+                                 -1 if other is None else other[i], moves[i]))
 
     grid = np.exp(np.arange(np.log(0.9 * band[0]), np.log(1.15 * band[1]), 0.03))
     for place, direction in fam.points.items():

@@ -189,10 +189,36 @@ def _step(joint: Joint, now: Point, at: tuple[Array, Array, Array], errors: Arra
         trial = (y + dy, theta + dt, x + dx)
         there = joint.at(*trial, errors, now.motions, coarse=coarse)
         new = joint.cost(there, trial[1], trial[2])
+        if not new < cost:
+            trial, there, new = _mended(joint, trial, there, new, errors, cost, coarse)
         if np.isfinite(new) and new < cost:
             return trial, there, new, damping
         damping = max(8 * damping, 1e-3)
     return at, None, cost, damping
+
+
+def _mended(joint: Joint, at: tuple[Array, Array, Array], there: Point, value: float, errors: Array, cost: float, coarse: bool
+            ) -> tuple[tuple[Array, Array, Array], Point, float]:
+    """A step that left the narrow valley of a sharp resonance, led back to it by the linear parameters alone if these promise to do so."""
+    y, theta, x = at
+    ext, prior = joint.ext, 1 / joint.sd ** 2
+    centre = np.zeros(len(theta))
+    if ext is not None:
+        prior, centre = np.concatenate([prior, 1 / ext.prior_sd ** 2]), np.concatenate([centre, ext.centre])
+    for _ in range(2):
+        if not np.isfinite(value):
+            break
+        system = assemble(joint.bench.family, theta, x, joint.s, there.cleaned, joint.variance, ext, spread=joint.h.fit.spread)
+        gradient = system.gradient - prior * (np.concatenate([theta, x]) - centre)
+        step = np.linalg.solve(system.normal + np.diag(prior), gradient)
+        if not float(gradient @ step) > 0.5 * (value - cost) or np.abs(step).max() > 1.0:
+            break
+        theta, x = theta + step[:len(theta)], x + step[len(theta):]
+        there = joint.at(y, theta, x, errors, there.motions, coarse=coarse)
+        value = joint.cost(there, theta, x)
+        if value < cost:
+            break
+    return (y, theta, x), there, value
 
 
 def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, errors: Array, moving: Sequence[int],

@@ -60,9 +60,9 @@ class Family:
     silent : ndarray (S', n)
         Channels that were left out of the analysis; their motion can be predicted all the same.
     mode_sd, damping_sd, drive_sd, dashpot_sd : float
-        Log-frequency deviation of one mode; log damping; relative error of one mode at the shaker; strength of a dashpot.
+        Log-frequency deviation of one mode; log damping; error of one mode at the shaker over its rms at the sensors; strength of a dashpot.
     shape_sd, beyond_sd : float
-        Relative error of one mode at one sensor, before the data have been seen; the same of modes beyond the band.
+        Error of one mode at one sensor over its rms at all of them, before the data have been seen; relative error of modes beyond the band.
     """
 
     names: tuple[str, ...]
@@ -133,8 +133,8 @@ class Modes:
         Mass-normalised modes in Ritz coordinates.
     undisturbed : ndarray (m,)
         rad/s without the deviations of single modes.
-    driven : ndarray (m,)
-        Factor on the modal force of the shaker.
+    driven : ndarray (modes,)
+        Error of each shape at the shaker, in units of :func:`shape_sizes`.
     viscous : ndarray (D,)
         Dashpots that couple the modes, N s/m.
     """
@@ -233,14 +233,26 @@ def solve(fam: Family, theta: Array) -> Modes:
     K = K + fam.mixing @ (form + form.T) @ fam.mixing.T
     M = np.tensordot(scale[count_k:], fam.M_parts, 1) + fam.M_rest
     values, basis = la.eigh(K, M)
+    basis[:, :fam.modes] *= _orientation(fam, basis)
     omega = np.sqrt(np.maximum(values, 1e-6))
     undisturbed = omega.copy()
     zeta = np.full(len(omega), fam.damping)
     omega[:fam.modes] *= np.exp(np.clip(detuned, -0.3, 0.3))
     zeta[:fam.modes] *= np.exp(np.clip(damped, -4, 4))
-    force = np.ones(len(omega))
-    force[:fam.modes] += np.clip(driven, -0.5, 0.5)
-    return Modes(omega, zeta, basis, undisturbed, force, fam.dashpot * np.clip(dashed, -5, 5))
+    return Modes(omega, zeta, basis, undisturbed, np.clip(driven, -0.5, 0.5), fam.dashpot * np.clip(dashed, -5, 5))
+
+
+def _orientation(fam: Family, basis: Array) -> Array:
+    """(modes,): signs that make the modes point as the nominal ones do, so that errors of their shapes keep their meaning."""
+    alike = (fam.mixing.T @ basis[:, :fam.modes])
+    own = np.diag(alike)
+    most = alike[np.argmax(np.abs(alike), axis=0), np.arange(fam.modes)]
+    return np.where(np.where(np.abs(own) > 0.1 * np.abs(most), own, most) < 0, -1.0, 1.0)
+
+
+def shape_sizes(fam: Family, modes: Modes) -> Array:
+    """(modes,): rms over the sensors of each mode in the band, the unit of errors of its shape, which do not vanish at its nodes."""
+    return np.asarray(np.sqrt(np.mean((fam.sensors @ modes.basis[:, :fam.modes]) ** 2, axis=0)))
 
 
 @final
@@ -277,7 +289,8 @@ class Fields:
 def fields(fam: Family, modes: Modes, s: Complex, attach: tuple[Attachment, ...] = (), most: int = 45) -> Fields:
     """Accelerance and the modal vectors to both sides of it (exact with attachments, by the Woodbury identity)."""
     D = modes.denominators(s)
-    f, S = (fam.shaker @ modes.basis) * modes.driven, fam.sensors @ modes.basis
+    f, S = fam.shaker @ modes.basis, fam.sensors @ modes.basis
+    f[:fam.modes] += modes.driven * shape_sizes(fam, modes)
     right = f / D
     if not attach:
         H = s[:, None] ** 2 * (right @ S.T)
@@ -366,7 +379,7 @@ def jacobian(fam: Family, theta: Array, fld: Fields, s: Complex) -> Complex:
     damp = 2 * zeta * omega * s[:, None]
     out[count:count + fam.modes] = np.moveaxis(-s2[:, None] * detune[:, :, None] * own, 1, 0)
     out[count + fam.modes:fam.moving] = np.moveaxis(-s2[:, None] * damp[:, :, None] * own, 1, 0)
-    pushed = fld.left[:, :, :fam.modes] * (fam.shaker @ basis[:, :fam.modes])
+    pushed = fld.left[:, :, :fam.modes] * shape_sizes(fam, fld.modes)
     out[fam.moving:fam.moving + fam.modes] = np.moveaxis(s2[:, None] * pushed, 2, 0)
     if len(fam.dashpots):
         joined = fam.moving + fam.modes + np.arange(len(fam.dashpots))

@@ -176,13 +176,22 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     fam, evidence = bench.family, bench.evidence
     effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
     s, variance = evidence.spectra.s[evidence.excited], floored(evidence.H, evidence.variance)
-    begin = [(start.theta, x)]
+    begin = [_moved(start, x, candidates)]
     if ext is not None and strained(fam, start.theta, sd):
         begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
     ends = [descend(fam, t, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03, spread=start.spread) for t, y in begin]
     theta, x, _ = min(ends, key=lambda e: e[2])
     fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=start.spread)
     return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
+
+
+def _moved(start: LinearFit, x: Array, candidates: tuple[Candidate, ...]) -> tuple[Array, Array]:
+    """Parameters of the linear fit and of its extension where the last candidate's column promised to lead."""
+    theta, moves = start.theta, candidates[-1].moves if candidates else np.zeros(0)
+    if len(moves) == len(theta) + len(start.x):
+        theta, x = theta + moves[:len(theta)], x.copy()
+        x[:len(start.x)] += moves[len(theta):]
+    return theta, x
 
 
 def _prepared(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]
