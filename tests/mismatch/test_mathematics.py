@@ -11,14 +11,14 @@ from scipy.linalg import eigh
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.forces.motion import force_along, motion
 from bayes_nlsid.forces.term import Term
-from bayes_nlsid.mismatch.calibrate import assemble, calibrate, finish, floored
+from bayes_nlsid.mismatch.calibrate import assemble, calibrate, descend, finish, floored
 from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, catalogue_rows
 from bayes_nlsid.mismatch.effects import Effect, along_period, pack, unpack
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.form import PSEUDO
 from bayes_nlsid.mismatch.krylov import gmres
 from bayes_nlsid.mismatch.laws import Size
-from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, solve
+from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, receptances, shape_sizes, solve
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import LawAlong, bed
 from bayes_nlsid.mismatch.poles import pair, vector_fit
@@ -149,7 +149,10 @@ def test_errors_of_form_are_stiffness_between_nominal_modes_and_dashpots_couple_
     form[fam.pairs] = theta[-len(fam.pairs[0]):]
     K = fam.K_parts.sum(0) + fam.K_rest + fam.mixing @ (form + form.T) @ fam.mixing.T
     M = fam.M_parts[0]
-    force = M @ (modes := solve(fam, theta)).basis @ (modes.driven * (fam.shaker @ modes.basis))
+    modes = solve(fam, theta)
+    modal = fam.shaker @ modes.basis
+    modal[:fam.modes] += 0.02 * shape_sizes(fam, modes)
+    force = M @ modes.basis @ modal
     damping = np.diag(2 * modes.zeta * modes.omega)
     for c in (0.0, 0.03, 0.003):
         theta[fam.moving + fam.modes] = c
@@ -158,6 +161,35 @@ def test_errors_of_form_are_stiffness_between_nominal_modes_and_dashpots_couple_
         C = M @ modes.basis @ coupled @ modes.basis.T @ M
         exact = np.array([sk ** 2 * fam.sensors @ np.linalg.solve(M * sk ** 2 + C * sk + K, force) for sk in s])
         assert np.linalg.norm(fields(fam, solve(fam, theta), s).H - exact) < (1e-9 + 30 * c ** 2) * np.linalg.norm(exact)
+
+
+def test_modes_keep_their_signs_so_that_errors_of_their_shapes_keep_their_meaning() -> None:
+    fam = chain_family()
+    rng = np.random.default_rng(8)
+    nominal = solve(fam, np.zeros(fam.size)).basis[:, :fam.modes]
+    for _ in range(20):
+        moved = solve(fam, 2 * rng.normal(size=fam.size) * fam.prior_sd).basis[:, :fam.modes]
+        assert (np.einsum("nm,nk,km->m", nominal, np.einsum("pij->ij", fam.M_parts) + fam.M_rest, moved) > 0).all()
+
+
+def test_calibration_follows_narrow_bent_valleys_to_one_optimum() -> None:
+    fam = chain_family(sensors=3)
+    rng = np.random.default_rng(21)
+    truth = 0.7 * rng.normal(size=fam.size) * fam.prior_sd
+    truth[fam.moving + fam.modes:][:len(fam.dashpots)] = 0
+    s = 2j * np.pi * np.linspace(2, 150, 400)
+    H = fields(fam, solve(fam, truth), s).H
+    noise = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    H = H + noise * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape)) / np.sqrt(2)
+    variance = np.full(H.shape, noise ** 2)
+    best, _, cost = descend(fam, truth, s, H, variance, 40, tol=1e-6)
+    normal = assemble(fam, best, np.zeros(0), s, H, variance).normal + np.diag(1 / fam.prior_sd ** 2)
+    weak = np.linalg.eigh(fam.prior_sd[:, None] * normal * fam.prior_sd)[1][:, :3]
+    for along in weak.T:
+        start = best + 3 * fam.prior_sd * along
+        rise = descend(fam, start, s, H, variance, 0)[2] - cost
+        end, _, there = descend(fam, start, s, H, variance, 12, tol=1e-6)
+        assert rise > 5 and abs(there - cost) < 1e-3 and np.abs(end - best).max() < 1e-3
 
 
 def test_cost_is_the_marginal_likelihood_of_random_shape_errors() -> None:

@@ -60,9 +60,11 @@ class Family:
     silent : ndarray (S', n)
         Channels that were left out of the analysis; their motion can be predicted all the same.
     mode_sd, damping_sd, drive_sd, dashpot_sd : float
-        Log-frequency deviation of one mode; log damping; error of one mode at the shaker over its rms at the sensors; strength of a dashpot.
+        Log-frequency deviation of one mode; log damping; error of one mode at the shaker over its rms at the sensors; strength of a
+        dashpot.
     shape_sd, beyond_sd : float
-        Error of one mode at one sensor over its rms at all of them, before the data have been seen; relative error of modes beyond the band.
+        Error of one mode at one sensor over its rms at all of them, before the data have been seen; relative error of modes beyond the
+        band.
     """
 
     names: tuple[str, ...]
