@@ -179,7 +179,7 @@ def test_calibration_follows_narrow_bent_valleys_to_one_optimum() -> None:
     truth[fam.moving + fam.modes:][:len(fam.dashpots)] = 0
     s = 2j * np.pi * np.linspace(2, 150, 400)
     H = fields(fam, solve(fam, truth), s).H
-    noise = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    noise = 1e-5 * np.sqrt(np.mean(np.abs(H) ** 2))
     H = H + noise * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape)) / np.sqrt(2)
     variance = np.full(H.shape, noise ** 2)
     best, _, cost = descend(fam, truth, s, H, variance, 40, tol=1e-6)
