@@ -19,11 +19,12 @@ from bayes_nlsid.mismatch.disturb import disturbances, without_hum
 from bayes_nlsid.mismatch.effects import Effect, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence, gather, level_transfer
 from bayes_nlsid.mismatch.explain import sizes
-from bayes_nlsid.mismatch.linear import Family, family
+from bayes_nlsid.mismatch.linear import Family
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis
 from bayes_nlsid.mismatch.probability import SHIPPED, Key, Layer, Score, Scores, probabilities
 from bayes_nlsid.mismatch.prove import Bands, Predictor, calibrate_bands, elpd_difference, nrmse
+from bayes_nlsid.mismatch.reduced import family
 from bayes_nlsid.mismatch.rivals import Rival, all_rivals, on_trial
 from bayes_nlsid.mismatch.search import Found, search
 from bayes_nlsid.mismatch.spectra import Spectra, burst_spectra, noise_density, steady_spectra
