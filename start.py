@@ -18,6 +18,7 @@ RUN_LOCK = ROOT / "requirements" / "lock.txt"
 TEST_LOCK = ROOT / "requirements" / "lock-test.txt"
 MAIN_JOB = ("run", "studies/brake_reuss_beam/study.toml", "--out", "results/brb")
 OLDEST = (3, 11)
+SIDE_BY_SIDE = ("-n", "auto", "--maxprocesses", "8", "--dist", "loadfile")  # a process for each core; more than 8 only compile the same
 
 
 def say(sentence):
@@ -131,7 +132,7 @@ def call(arguments):
 
 
 def main(arguments):
-    """`run` and `test`; anything after the word is handed on to nlsid or pytest."""
+    """`run` and `test`; anything after the word is handed on to nlsid or pytest (`-n 0` for one process)."""
     if sys.version_info < OLDEST:
         needed = ".".join(str(number) for number in OLDEST)
         stop(f"Python {needed} or newer is needed, this is {sys.version.split()[0]}; use for instance python3.12.")
@@ -141,7 +142,7 @@ def main(arguments):
         return call(["-m", "bayes_nlsid", *MAIN_JOB, *rest])
     if word == "test":
         set_up([RUN_LOCK, TEST_LOCK])
-        return call(["-m", "pytest", *rest])
+        return call(["-m", "pytest", *SIDE_BY_SIDE, *rest])
     if word == "setup":
         set_up([RUN_LOCK, TEST_LOCK])
         return 0

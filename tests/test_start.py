@@ -96,6 +96,15 @@ def test_linear_algebra_gets_one_thread_unless_the_user_says_otherwise(start: Mo
     assert given[0]["OMP_NUM_THREADS"] == "3" and given[0]["OPENBLAS_NUM_THREADS"] == "1" and "PATH" in given[0]
 
 
+def test_tests_run_side_by_side_unless_the_user_says_otherwise(start: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[list[str]] = []
+    monkeypatch.setattr(start, "set_up", lambda locks: None)
+    monkeypatch.setattr(start, "call", lambda arguments: given.append(arguments) or 0)
+    assert start.main(["test", "-n", "0", "-k", "symlog"]) == 0
+    options = given[0]
+    assert options[:2] == ["-m", "pytest"] and options[2:4] == ["-n", "auto"] and options[-4:] == ["-n", "0", "-k", "symlog"]
+
+
 def test_a_folder_that_is_no_environment_is_left_alone(start: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "precious.txt").write_text("mine")
     monkeypatch.setattr(start, "ENVIRONMENT", tmp_path)
