@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayes_nlsid.simulation import integration
 from bayes_nlsid.study import pictures
 from bayes_nlsid.study.reading import read_study
 from bayes_nlsid.study.run import run_study
@@ -35,6 +36,12 @@ def finished(small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("finished") / "out"
     run_study(read_study(small), out)
     return out
+
+
+@pytest.fixture(autouse=True)
+def _compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs shorter than those of studies go by the compiled loop too; tests of simulation show that it gives the same numbers."""
+    monkeypatch.setattr(integration, "LONG_RUN", 500)
 
 
 @pytest.fixture

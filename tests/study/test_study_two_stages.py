@@ -26,7 +26,7 @@ def run(small: Path, out: Path, posterior: str, **changes: str) -> tuple[int, di
     return code, json.loads((out / "result.json").read_text()) if (out / "result.json").exists() else {}
 
 
-def test_both_stages_by_default_and_the_truth_in_the_second(small: Path, tmp_path: Path) -> None:
+def test_both_stages_by_default_and_the_truth_in_the_second(small: Path, quick: None, tmp_path: Path) -> None:
     """Truth of the example: 20.3 Hz, 1.2 %, 4e8 N/m³, made by Runge–Kutta."""
     code, result = run(small, tmp_path / "both", CONVERGED, candidates='["cubic"]')
     assert code == 0 and result["status"] == "ok", result["reasons"]
