@@ -265,6 +265,7 @@ def test_inference_data_and_netcdf(tmp_path):
     found = sample(start, likelihood=likelihood, seed=1, steps=60, most=400, ensembles=2, block=20)
     data = to_inference_data(found, likelihood, blocks_of=40)
     assert set(data.groups()) == {"posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data"}
+    assert "physical parameter" in data["constant_data"].attrs["prior_space"]
     chain = data["posterior"]["q|q|[J1].c"]
     assert chain.shape == (2 * 20, found.theta.shape[1]) and chain.attrs["units"] == "N/m^2"
     assert np.array_equal(chain.values[20], found.theta[1, :, 0, 2])

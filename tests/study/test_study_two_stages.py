@@ -34,6 +34,9 @@ def test_both_stages_by_default_and_the_truth_in_the_second(small: Path, quick: 
     assert result["posterior"]["stage"] == "both" and second["k_hat"] < 0.7 and not second["misfit"]["found"]
     cubic = next(p for p in result["parameters"] if p["name"] == "cubic[x].c")
     width = cubic["q95"] - cubic["q05"]
+    prior = cubic["prior"]
+    assert prior["kind"] == "normal" and prior["a"] == 0 and prior["lower"] < -prior["b"] < prior["b"] < prior["upper"]
+    assert "physical parameter" in result["posterior"]["prior_space"]
     assert abs(cubic["q50"] - 4e8) < 1.5 * width and width < 0.01 * 4e8
     assert cubic["regression"]["q05"] < cubic["regression"]["q95"]
     assert {row["name"] for row in second["against_regression"]} == {p["name"] for p in result["parameters"]}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.inference.likelihood import Likelihood
 from bayes_nlsid.inference.posterior import Posterior
+from bayes_nlsid.inference.prior import SPACE
 
 
 @contextmanager
@@ -150,7 +151,7 @@ def _constant(posterior: Posterior, xarray: Any) -> Any:
             "prior_b": np.array([p.b for p in posterior.priors])}
     data = {k: (("parameter",), v) for k, v in rows.items()}
     return xarray.Dataset(data, coords={"parameter": list(posterior.names)},
-                          attrs={"prior_kinds": ",".join(p.kind for p in posterior.priors)})
+                          attrs={"prior_kinds": ",".join(p.kind for p in posterior.priors), "prior_space": SPACE})
 
 
 def _likelihood_groups(likelihood: Likelihood, chains: NDArray[np.float64], most: int, xarray: Any) -> dict[str, Any]:

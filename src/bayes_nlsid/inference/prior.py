@@ -22,6 +22,7 @@ from bayes_nlsid.structure.modal import ASSUMED
 
 Kind = Literal["normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal"]
 KINDS = ("normal", "lognormal", "uniform", "loguniform", "halfnormal", "logitnormal")
+SPACE = "density of the physical parameter in its unit, cut at its bounds; search coordinates (symlog, log10) bring their Jacobian along"
 SHARE = 0.1        # a term as large as a tenth of the whole linear force, one standard deviation
 Array = NDArray[np.float64]
 

@@ -75,7 +75,8 @@ def posterior(context: Context) -> Result:
     arrays["prior_draws"] = np.stack([p.sample(PRIOR_DRAWS, rng) for p in priors], axis=1)
     _keep_whole(context, found, likelihood, arrays)
     data |= {"stage": stage, "stage_why": why,
-             "priors": [{"parameter": p.name, "text": p.sentence.removeprefix(f"{p.name}: ")} for p in priors]}
+             "priors": [{"parameter": p.name, "text": p.sentence.removeprefix(f"{p.name}: "), "kind": p.kind, "a": p.a, "b": p.b,
+                         "lower": p.lower, "upper": p.upper} for p in priors]}
     return arrays, data
 
 
@@ -152,10 +153,9 @@ def _results(found: Posterior, likelihood: Likelihood) -> Result:
 def _empty() -> dict[str, Any]:
     """A linear model without free parameters has nothing to sample."""
     return {"names": [], "units": [], "identifiable": [], "status": "ok", "reasons": ["the chosen model has no free parameters"],
-            "burn_in": 0,
-            "priors": [], "likelihood": "", "stage": "regression", "stage_why": "nothing to sample",
-            "convergence": {"ensembles": 0, "steps": 0, "walkers": 0, "converged": True, "rhat_max": None,
-                                                            "ess_min": None, "stuck_walkers": 0}}
+            "burn_in": 0, "priors": [], "likelihood": "", "stage": "regression", "stage_why": "nothing to sample",
+            "convergence": {"ensembles": 0, "steps": 0, "walkers": 0, "converged": True, "rhat_max": None, "ess_min": None,
+                            "stuck_walkers": 0}}
 
 
 def _likelihood(entry: PosteriorEntry, start: Fit) -> Likelihood:

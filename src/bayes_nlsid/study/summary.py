@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bayes_nlsid.inference.prior import SPACE
 from bayes_nlsid.study.schema import EXTRAS, Study
 from bayes_nlsid.study.store import Saved, versions
 
@@ -38,7 +39,8 @@ def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, A
         out["parameters"] = _parameters(done)
     if "posterior" in done:
         out["convergence"] = done["posterior"].data["convergence"]
-        out["posterior"] = {key: done["posterior"].data.get(key) for key in ("stage", "stage_why", "likelihood", "second_stage")}
+        out["posterior"] = {"prior_space": SPACE} | {
+            key: done["posterior"].data.get(key) for key in ("stage", "stage_why", "likelihood", "second_stage")}
     if "predict" in done:
         out["heldout"] = _heldout(done["predict"])
         out["backbone"] = done["predict"].data.get("backbone", {})
@@ -124,6 +126,9 @@ def _parameters(done: Mapping[str, Saved]) -> list[dict[str, Any]]:
             row |= {"q05": float(quantiles[0, i]), "q50": float(quantiles[1, i]), "q95": float(quantiles[2, i]),
                     "identifiable": bool(saved.data["identifiable"][i]), "narrowing": float(saved.arrays["narrowing"][i]),
                     "ess": float(saved.arrays["ess"][i]), "tau": float(saved.arrays["tau"][i])}
+        priors = {p["parameter"]: {key: value for key, value in p.items() if key != "parameter"} for p in saved.data["priors"]}
+        for row in rows:
+            row["prior"] = priors.get(row["name"])
         if "regression_quantiles" in saved.arrays:
             for i, row in enumerate(rows):
                 low, middle, high = (float(x) for x in saved.arrays["regression_quantiles"][:, i])
