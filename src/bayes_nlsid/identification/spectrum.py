@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def fast_length(n: int) -> int:
-    """Largest number of samples up to ``n`` without prime factors above 5, for which the transform is quick."""
+    """Largest number of samples up to ``n`` without prime factors above 5, for which the transform is quick.
+
+    Raises
+    ------
+    ValueError
+        If n is below 1.
+    """
     for m in range(n, 0, -1):
         rest = m
         for prime in (2, 3, 5):
@@ -22,7 +28,13 @@ def fast_length(n: int) -> int:
 
 
 def tukey(n: int, fraction: float) -> NDArray[np.float64]:
-    """Cosine taper (n,) over ``fraction`` of the samples (half at each end), scaled to unit mean square."""
+    """Cosine taper (n,) over ``fraction`` of the samples (half at each end), scaled to unit mean square.
+
+    Raises
+    ------
+    ValueError
+        If the fraction does not lie in [0, 1].
+    """
     if not 0 <= fraction <= 1:
         raise ValueError(f"taper fraction must lie in [0, 1], got {fraction}")
     edge = fraction * n / 2
@@ -118,7 +130,13 @@ class Spectrum:
 
     def apply(self, samples: ArrayLike) -> NDArray[np.float64]:
         """Transform (..., n) of the whole recording, or (..., count) of the samples that enter, to (..., 2 bins): real parts, then
-        imaginary."""
+        imaginary.
+
+        Raises
+        ------
+        ValueError
+            If the last axis has another length.
+        """
         values = np.asarray(samples, dtype=float)
         if values.shape[-1] == self.n and self.n != self.count:
             values = values[..., self.samples]

@@ -221,7 +221,13 @@ class Release:
 
 def release_of(theta: Array, model: Model, at: str, amplitude: float, mode: int, amplitudes: ArrayLike | None, stop: float | None,
              fs: float | None, duration: float | None) -> Release:
-    """Checked and completed arguments of `backbone_bands`."""
+    """Checked and completed arguments of `backbone_bands`.
+
+    Raises
+    ------
+    ValueError
+        As there.
+    """
     if not 0 <= mode < model.linear.modes:
         raise ValueError(f"mode {mode} does not exist; the model has modes 0 to {model.linear.modes - 1}")
     if not (np.isfinite(amplitude) and amplitude > 0):

@@ -112,7 +112,13 @@ class _Content:
         self.said += f"; {count} degrees of freedom without mass were condensed" if count else ""
 
     def add(self, where: str, name: str, row: NDArray[np.float64], role: str) -> None:
-        """One location; a name may be given again only for another role with the same row."""
+        """One location; a name may be given again only for another role with the same row.
+
+        Raises
+        ------
+        InputError
+            If the role is unknown, the row (n,) has another length, or the name stands for another row already.
+        """
         if role not in ROLES:
             raise InputError(where, f"location {name!r} has unknown role {role!r}", f"use one of {', '.join(ROLES)}")
         if row.shape != (len(self.dofs),):

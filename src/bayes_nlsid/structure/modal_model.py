@@ -82,7 +82,13 @@ def modal_model(source: Structure | Reduced, modes: int | Sequence[int] = 10, *,
 
 def with_damping(model: ModalModel, zeta: float | Sequence[float] | NDArray[np.float64] | IdentifiedModes,
                  measured_frequencies: bool = False) -> ModalModel:
-    """The model with other damping ratios, and optionally measured frequencies; see `modal_model`."""
+    """The model with other damping ratios, and optionally measured frequencies; see `modal_model`.
+
+    Raises
+    ------
+    ValueError
+        If the ratios are negative or not one for each mode, or measured frequencies are asked of plain numbers.
+    """
     from bayes_nlsid.structure.identified import IdentifiedModes, pair
 
     if not isinstance(zeta, IdentifiedModes):

@@ -164,7 +164,7 @@ def _backbone(study: Study, done: Mapping[str, Saved]) -> list[Picture]:
     published = [{"label": p.label, "frequency": p.frequency, "damping": p.damping} for p in study.report.published]
     image = png(backbone_bands, arrays, measured, location=data["at"], alternatives=rivals, published=published,
                 numerical=arrays.get("numerical_error_frequency"))
-    circles = " Circles are measured directly from the recording by zero crossings and were not fitted." if measured is not None else ""
+    circles = " Circles are read directly from the recording by zero crossings, without any model." if measured is not None else ""
     start = compared(arrays, measured)[0]
     below = (f" The model's curve goes on below what was measured, down to {engineering(float(arrays['amplitude'][0]), 'm')}, in "
              "backbone.npz.") if arrays["amplitude"][0] < 0.8 * start else ""

@@ -1,4 +1,7 @@
-"""The tables of a study file for the commands beside the run: ``[frf]``, ``[montecarlo]`` and ``[compare]``."""
+"""The tables of a study file for the commands beside the run: ``[frf]``, ``[montecarlo]`` and ``[compare]``.
+
+Every function raises `InputError` with file, table, key and mend where the table cannot be used as it stands.
+"""
 
 from __future__ import annotations
 

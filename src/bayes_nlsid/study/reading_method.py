@@ -1,4 +1,7 @@
-"""The tables of a study file that say how to identify, sample, predict and report."""
+"""The tables of a study file that say how to identify, sample, predict and report.
+
+Every function raises `InputError` with file, table, key and mend where the table cannot be used as it stands.
+"""
 
 from __future__ import annotations
 

@@ -27,12 +27,12 @@ def columns(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[
 def _wrapped(text: str) -> str:
     from textwrap import fill
 
-    return fill(text, WIDTH)
+    return fill(text, WIDTH, subsequent_indent="    " if text.startswith("  ") else "")
 
 
 def summary(result: Mapping[str, Any], out: Path) -> str:
     """One screen: which force laws were found, parameters with 5/50/95 %, convergence, held-out error, files."""
-    parts = [f"{result['title']}: {status_words(result)}"]
+    parts = [_wrapped(f"{result['title']}: {status_words(result)}")]
     parts += [_wrapped(f"  reason: {brief(reason)}") for reason in result["reasons"][:4]]
     if result.get("selection") is not None:
         parts.append(_wrapped(f"  found: {brief(found_words(result))}"))

@@ -94,7 +94,13 @@ def _plain(value: Any) -> Any:
 
 @contextmanager
 def writing(where: Path) -> Iterator[None]:
-    """Turn a full disk or a forbidden folder into one sentence."""
+    """Turn a full disk or a forbidden folder into one sentence.
+
+    Raises
+    ------
+    InputError
+        In place of the `OSError` of the block, if it is one of these.
+    """
     try:
         yield
     except OSError as error:

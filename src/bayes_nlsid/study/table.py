@@ -54,6 +54,11 @@ class Table:
     Notes
     -----
     Every method takes ``default``; without one the key is required. `close` must be called last.
+
+    Raises
+    ------
+    InputError
+        By every method, naming file, table and key with the mend: if a key is missing, or its value is of another kind or out of range.
     """
 
     def __init__(self, file: Path, name: str, content: object) -> None:
