@@ -273,7 +273,7 @@ def _damped(at: Callable[..., Place], here: Place, damping: float) -> tuple[Plac
     for _ in range(6):
         step = np.linalg.solve(here.normal + damping * np.diag(np.diag(here.normal)), here.gradient)
         trial = here.y + np.clip(step, -LONGEST, LONGEST)
-        if at(trial, False).cost < here.cost:
+        if np.isfinite(trial).all() and at(trial, False).cost < here.cost:
             return at(trial), max(damping / 6, 1e-9)
         damping = max(damping * 8, 1e-4)
     return None, damping

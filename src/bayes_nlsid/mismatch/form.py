@@ -41,7 +41,7 @@ def likeliest_groups(fam: Family, theta: Array, normal: Array, gradient: Array, 
         precision = np.zeros(len(normal))
         precision[:count] = 1 / sd ** 2
         inverse = np.linalg.inv(normal + np.diag(precision))
-        best, variance = inverse @ target, np.diag(inverse)
+        best, variance = inverse @ target, np.maximum(np.diag(inverse), 0.0)   # rounding, where a parameter hardly matters
         for g in groups(fam):
             n = g.stop - g.start
             sd[g] = np.sqrt((GROUP_PSEUDO * usual[g] ** 2 + (best[g] ** 2 + variance[g]).sum()) / (GROUP_PSEUDO + n))

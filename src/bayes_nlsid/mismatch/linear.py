@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 BEYOND = 3  # groups of modes beyond the band whose contribution may be in error: the next, the one after it, all others
-ABOVE = 1.5  # times the end of the band, up to where a mode has its own frequency and damping
+ABOVE = 2.0  # times the end of the band, up to where a mode has its own frequency and damping
 
 
 @final

@@ -73,13 +73,6 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         fit, estimates = _estimated(bench, fit, columns)
         none = bench.evidence.chi2 + fit.cost
         singles = _better(singles, estimates)
-    asked = linear_too and top_linear > 40
-    if asked and (not singles or singles[0].fit.cost + singles[0].misfit_records > 1.02 * (fit.dof + bench.evidence.values) or
-                  singles[0].fit.cost > 1.02 * fit.dof):
-        # a stiff relaxing branch has a column that is a poor guide: try one at every joint, if nothing simpler explains the data
-        centre = 1.5 * float(np.sqrt(band[0] * band[1]))
-        slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
-        singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
     singles, finished = _promising(bench, singles, short)
     if not linear_too and latents and singles and singles[0].misfit_records > 2 * bench.evidence.values:
         where = max(latents, key=lambda x: x.explained).place
@@ -207,13 +200,13 @@ def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> l
 
 
 def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]:
-    """The best linear effects by their columns (relaxing branches apart)."""
+    """The best linear effects by their columns."""
     candidates = [c for c in candidates if _worth(c)]
     if not candidates:
         return []
     top = candidates[0].gain
     limit = max(WORTH, (0.15 if top < CLEAR else 0.5) * top)
-    return [c for c in _unique(candidates) if c.gain > limit and c.effect.kind != "maxwell"][:most]
+    return [c for c in _unique(candidates) if c.gain > limit][:most]
 
 
 def _better(first: list[Hypothesis], second: list[Hypothesis]) -> list[Hypothesis]:
@@ -313,7 +306,7 @@ def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[floa
     forces, _, _ = scan_forces(bench.family, first.fit, bench.evidence, places, first.residual)
     linear = scan_linear(bench.family, first.fit, bench.channels, bench.mass, bench.stiffness, band)
     own = {e.key for e in first.effects}
-    pool = [c for c in _unique(forces)[:3] + _unique([c for c in linear if c.effect.kind != "maxwell"])[:4]
+    pool = [c for c in _unique(forces)[:3] + _unique(linear)[:4]
             if c.gain > max(SECOND, 0.02 * left) and c.effect.key not in own]
     lead = _lead(first)
     out = []
