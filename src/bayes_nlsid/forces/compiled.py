@@ -68,7 +68,8 @@ def _scalar_where(condition: Any, yes: Any, no: Any) -> Any:
     return lambda condition, yes, no: yes if condition else no
 
 
-for _block in (memory.turning_point, memory.slider_step, memory.bouc_wen_step, memory.bouc_wen_slope):
+for _block in (memory.turning_point, memory.slider_step, memory.bouc_wen_form, memory.bouc_wen_piece, memory.bouc_wen_step,
+               memory.bouc_wen_slope):
     numba.extending.register_jitable(_block)  # compiled code may call it, and compiles it from here
 
 # --- laws by number -----------------------------------------------------------------------------------------------------------
@@ -358,8 +359,9 @@ def march_bouc_wen(moves: NDArray[np.float64], p: NDArray[np.float64]) -> NDArra
     force = np.empty((batch, len(moves)))
     for b in range(batch):
         z = 0.0
+        power, above, below, fixed, near, half, far = memory.bouc_wen_form(p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
         for i in range(len(moves)):
-            z = memory.bouc_wen_step(z, moves[i], p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
+            z = memory.bouc_wen_piece(z, moves[i], p[b, 0], power, above, below, fixed, near, half, far)
             force[b, i] = z
     return force
 
@@ -371,6 +373,7 @@ def march_bouc_wen_each(start: NDArray[np.float64], moves: NDArray[np.float64], 
     force = np.empty((batch, count + 1))
     for b in range(batch):
         force[b, 0] = start[b]
+        power, above, below, fixed, near, half, far = memory.bouc_wen_form(p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
         for i in range(count):
-            force[b, i + 1] = memory.bouc_wen_step(force[b, i], moves[b, i], p[b, 0], p[b, 1], p[b, 2], p[b, 3], p[b, 4])
+            force[b, i + 1] = memory.bouc_wen_piece(force[b, i], moves[b, i], p[b, 0], power, above, below, fixed, near, half, far)
     return force

@@ -145,21 +145,41 @@ def bouc_wen_step(z: Value, move: Value, alpha: Value, beta: Value, gamma: Value
     z = 0, so that the order is kept. With 64 pieces per half-cycle of a well-rounded loop the largest error is 1e-6 (nu = 2) to
     1e-5 (nu = 1.5) of the largest force; with 16 it is 5e-5 to 2e-4.
     """
-    direction = where(move < 0.0, -1.0, 1.0)
-    step = np.abs(move) / SUBSTEPS
+    power, above, below, fixed, near, half, far = bouc_wen_form(alpha, beta, gamma, delta, nu)
+    return bouc_wen_piece(z, move, alpha, power, above, below, fixed, near, half, far)
+
+
+def bouc_wen_form(alpha: Value, beta: Value, gamma: Value, delta: Value, nu: Value
+                  ) -> tuple[Value, Value, Value, Value, Value, Value, Value]:
+    """What ``bouc_wen_step`` needs of its parameters at every piece of a path.
+
+    Returns
+    -------
+    power, above, below, fixed, near, half, far
+        Exponent; how the loop bends for d z ≥ 0 and below; where it settles (1 if nowhere); the quadrature nodes to that exponent.
+    """
     power = np.maximum(nu, 1.0)
-    # In y = d z, with d q growing: dy/dx = alpha − bend |y|^nu, where bend changes only with the sign of y.
-    y = direction * z
     above, below = beta * (gamma + delta), beta * (delta - gamma)
     # Fixed point (alpha/bend)^(1/nu) for y ≥ 0, if the loop has one.
     bounded = (above > 0.0) & (alpha > 0.0)
     fixed = where(bounded, where(bounded, alpha / where(bounded, above, 1.0), 1.0) ** (1.0 / power), 1.0)
+    return power, above, below, fixed, NEAR ** power, 0.5 ** power, FAR ** power
+
+
+def bouc_wen_piece(z: Value, move: Value, alpha: Value, power: Value, above: Value, below: Value, fixed: Value, near: Value, half: Value,
+                   far: Value) -> Value:
+    """``bouc_wen_step`` from the numbers of ``bouc_wen_form``, which paths of many pieces work out once."""
+    direction = where(move < 0.0, -1.0, 1.0)
+    step = np.abs(move) / SUBSTEPS
+    # In y = d z, with d q growing: dy/dx = alpha − bend |y|^nu, where bend changes only with the sign of y.
+    y = direction * z
+    bounded = (above > 0.0) & (alpha > 0.0)
     for _ in range(SUBSTEPS):
         size = np.abs(y)
         steep = size ** (power - 1.0)
         # Three-point Gauss quadrature of dx = dy / (alpha − below |y|^nu) from y up to zero; no crossing if that is not positive.
         bent = below * size * steep
-        one, two, three = alpha - bent * NEAR ** power, alpha - bent * 0.5 ** power, alpha - bent * FAR ** power
+        one, two, three = alpha - bent * near, alpha - bent * half, alpha - bent * far
         rises = (one > 0.0) & (two > 0.0) & (three > 0.0)
         one, two, three = where(rises, one, 1.0), where(rises, two, 1.0), where(rises, three, 1.0)
         to_zero = size * (5.0 / one + 8.0 / two + 5.0 / three) / 18.0

@@ -81,9 +81,9 @@ def along_period(law: Law, values: Array, d: Array, v: Array, dt: float, periodi
 
 
 def _looping(law: Law, p: Array, d: Array, periodic: bool) -> Array:
-    """A rate law node by node; within a period it forgets how it began, so that the period before is enough of a start."""
+    """A rate law node by node; it forgets within some cycles how it began, so that half a period before is enough of a start."""
     assert law.convert is not None and law.term.stiffness is not None
-    before = d if periodic else d[:0]
+    before = d[len(d) // 2:] if periodic else d[:0]
     force = march(law.term.memory, np.concatenate([before, d]), law.convert(p))[:, len(before):]
     if law.excess:
         force = force - np.asarray(law.term.stiffness(*np.atleast_2d(p).T))[:, None] * d
