@@ -36,6 +36,7 @@ from bayes_nlsid.mismatch.spectra import repeats
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 STRONG = 1.5   # chi² of the projected residual over its expectation
+NEARBY = 1.25  # times the end of the band, up to where a mode's own deviations move the places noticeably
 
 
 @final
@@ -149,7 +150,7 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5, quick: bool = False, dou
     cost = joint.cost(now, theta, x)
     damping, curvature = 1e-3, h.curvature
     names = bench.family.names[:len(bench.family.K_parts)]
-    moving = [i for i, name in enumerate(names) if name in joint.places] if quick else list(range(bench.family.moving))
+    moving = [i for i, name in enumerate(names) if name in joint.places] if quick else _moving(joint, h)
     kept: tuple[Complex, Complex] | None = None
     for _ in range(steps):
         # columns of linear parameters are dear and change little: they serve while they lead on
@@ -176,6 +177,14 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5, quick: bool = False, dou
     found = hypothesis(bench, effects, h.kinds, fit, float((np.abs(now.residual) ** 2).sum()), curvature, now.residual / joint.root,
                        now.status, now.strengths)
     return found if doubt or found.cost < h.cost else h
+
+
+def _moving(joint: Joint, h: Hypothesis) -> list[int]:
+    """Linear parameters that the motion of a place depends on: all scales, deviations of modes in the band and a little beyond."""
+    fam = joint.bench.family
+    own = np.flatnonzero(h.fit.fields.modes.omega[:fam.modes] < NEARBY * np.abs(joint.s).max())
+    first = len(fam.names)
+    return [*range(first), *(first + own), *(first + fam.modes + own)]
 
 
 def _step(joint: Joint, now: Point, at: tuple[Array, Array, Array], errors: Array, normal: Array, gradient: Array, damping: float,

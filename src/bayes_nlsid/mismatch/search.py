@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.effects import Effect, pack
+from bayes_nlsid.mismatch.effects import pack
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, estimate_linear, everywhere
@@ -20,6 +20,7 @@ Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
 SECOND = 25.0  # the same for a second effect
 CLEAR = 1000.0  # gain of a linear effect that its column promises nearly rightly
+KINDS = (("hardening", "softening", "clearance", "asymmetric"), ("coulomb", "quad_damping"), ("hysteresis",))
 CHARGED = 6.0  # the same for each parameter: less than what it will be charged
 
 
@@ -196,7 +197,18 @@ def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> l
             if remembered > 2:
                 continue
         out.append(c)
-    return out[:most]
+    return _every_kind(out[:most], candidates)
+
+
+def _every_kind(chosen: list[Candidate], candidates: list[Candidate]) -> list[Candidate]:
+    """With the best of each kind of law that is not among the chosen: on a motion that a strong law has changed, a damper may look like a
+    spring."""
+    out = list(chosen)
+    for kind in KINDS:
+        best = next((c for c in candidates if c.effect.cls in kind), None)
+        if best is not None and best.gain > 0.1 * candidates[0].gain and all(c.effect.cls not in kind for c in out):
+            out.append(best)
+    return out
 
 
 def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]:
