@@ -8,40 +8,41 @@ from pathlib import Path
 
 import numpy as np
 
-from bayes_nlsid.mismatch.probability import FEATURES, SHIPPED, Layer, Scores, fit_layer, probabilities, scores_from
+from bayes_nlsid.mismatch.probability import FEATURES, SHIPPED, Key, Layer, Scores, fit_layer, probabilities, scores_from
+
+FLOOR = 1e-4  # a probability below this counts as this
 
 
-def gather(results: Path, answers: Path) -> tuple[list[Scores], list[tuple[tuple[str, str], ...]]]:
-    """Scores and true keys of all cases that have both.
-
-    A case whose effect the search did not even propose, although the catalogue has it, teaches nothing about how to weigh what was
-    proposed: it is left out. What is outside the catalogue counts as ``other``.
-    """
+def gather(results: Path, answers: Path) -> tuple[list[Scores], list[Key]]:
+    """Scores and true keys of all cases that have both; what is outside the catalogue is of class ``other``."""
     scores, truths = [], []
     for file in sorted(results.glob("*/scores.json")):
         sheet = answers / f"{file.parent.name}.json"
         if sheet.exists():
             effects = json.loads(sheet.read_text())["effects"]
-            one, truth = scores_from(json.loads(file.read_text())), tuple(sorted((e["cls"], e["loc"]) for e in effects))
-            if truth in {(), *(i.key for i in one.items)} or any(cls == "other" for cls, _ in truth):
-                scores.append(one)
-                truths.append(truth)
+            scores.append(scores_from(json.loads(file.read_text())))
+            truths.append(tuple(sorted((e["cls"], e["loc"]) for e in effects)))
     return scores, truths
 
 
-def log_loss(layer: Layer, scores: list[Scores], truths: list[tuple[tuple[str, str], ...]]) -> float:
-    """Mean of −log p of the truth; a truth that was not weighed counts as ``other``."""
+def classes(key: Key) -> tuple[str, ...]:
+    """Sorted classes of a key."""
+    return tuple(sorted(cls for cls, _ in key))
+
+
+def log_loss(layer: Layer, scores: list[Scores], truths: list[Key]) -> float:
+    """Mean of −log p of the true classes, at whatever place."""
     total = 0.0
     for one, truth in zip(scores, truths, strict=True):
-        p = probabilities(one, layer)
-        total -= float(np.log(max(p.get(truth, p.get((("other", "-"),), 0.0)), 1e-6)))
+        p = sum(x for key, x in probabilities(one, layer).items() if classes(key) == classes(truth))
+        total -= float(np.log(max(p, FLOOR)))
     return total / max(len(scores), 1)
 
 
 def refit(results: list[Path], answers: list[Path], spread: float = 1.0, folds: int = 5) -> Layer:
     """Fit on all cases and print the weights, with the log loss on cases left out."""
     scores: list[Scores] = []
-    truths: list[tuple[tuple[str, str], ...]] = []
+    truths: list[Key] = []
     for result, answer in zip(results, answers, strict=True):
         more = gather(result, answer)
         scores, truths = scores + more[0], truths + more[1]

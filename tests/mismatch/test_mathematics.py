@@ -22,7 +22,7 @@ from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, re
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import LawAlong, bed
 from bayes_nlsid.mismatch.poles import pair, vector_fit
-from bayes_nlsid.mismatch.probability import Score, Scores, fit_layer, probabilities
+from bayes_nlsid.mismatch.probability import BY_HAND, Score, Scores, features, fit_layer, probabilities, task_of, unproposed
 from bayes_nlsid.mismatch.prove import calibrate_bands, elpd_difference, nrmse
 from bayes_nlsid.mismatch.shapes import shape_columns
 from bayes_nlsid.mismatch.spectra import Spectra
@@ -170,6 +170,29 @@ def test_modes_keep_their_signs_so_that_errors_of_their_shapes_keep_their_meanin
     for _ in range(20):
         moved = solve(fam, 2 * rng.normal(size=fam.size) * fam.prior_sd).basis[:, :fam.modes]
         assert (np.einsum("nm,nk,km->m", nominal, np.einsum("pij->ij", fam.M_parts) + fam.M_rest, moved) > 0).all()
+
+
+def test_what_the_search_did_not_propose_keeps_a_reserve() -> None:
+    one = Scores((Score((("hardening", "J1"),), 300.0), Score((("clearance", "J1"), ("sensor_gain", "S2")), 320.0)))
+    keys, table = features(one)
+    missed = unproposed(keys, np.array([0.2, 0.6, 0.1, 0.1]))
+    assert sum(missed.values()) == pytest.approx(1.0)
+    assert (("hysteresis", "J1"),) in missed and (("sensor_gain", "-"),) in missed and (("force_gain", "FORCE"),) in missed
+    assert (("hardening", "J1"),) not in missed and (("hardening", "J1"), ("softening", "J1")) in missed
+    assert not any(key in missed for key in keys)
+    assert sum(probabilities(one).values()) == pytest.approx(1.0)
+    assert probabilities(one)[(("hysteresis", "J1"),)] > 0
+
+
+def test_the_layer_is_fitted_with_the_right_gradient() -> None:
+    one = Scores((Score((("hardening", "J1"),), 300.0), Score((("hardening", "J2"),), 290.0), Score((("clearance", "J1"),), 299.0)))
+    w = np.array(BY_HAND.weights)
+    for truth in ((("hardening", "J2"),), (("hysteresis", "J1"),), (), (("other", "J3"),)):
+        task = task_of(one, truth)
+        slope = task.loss(w, 0.03)[1]
+        for i in range(len(w)):
+            d = 1e-6 * (np.arange(len(w)) == i)
+            assert slope[i] == pytest.approx((task.loss(w + d, 0.03)[0] - task.loss(w - d, 0.03)[0]) / 2e-6, abs=1e-6)
 
 
 def test_calibration_follows_narrow_bent_valleys_to_one_optimum() -> None:

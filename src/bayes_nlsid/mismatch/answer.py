@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,13 @@ from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.diagnose import Analysis, Progress, Proof, Rival, claim, intervals, prove, rank
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.portrait import portrait
+from bayes_nlsid.mismatch.probability import STRANGE as OTHER
 from bayes_nlsid.mismatch.probability import Key, Layer
 from bayes_nlsid.mismatch.prove import Predictor, envelope
 from bayes_nlsid.mismatch.words import PHASES, error_percent, power_onset, separates, size_of, sure, whole_percent
 
 Array = NDArray[np.float64]
+LISTED = 12  # hypotheses that are listed place by place
 
 
 def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progress) -> Diagnosis:
@@ -59,37 +61,33 @@ def answer(analysis: Analysis, seed: int, layer: Layer, begun: float, say: Progr
 
 
 def _named(analysis: Analysis, odds: dict[Key, float], seed: int) -> tuple[Named, ...]:
+    """Hypotheses, likeliest first; beyond the first twelve the places of what is listed already count with it."""
     by_key: dict[Key, Rival] = {}
     for r in analysis.rivals:
         if r.key not in by_key or r.gain > by_key[r.key].gain:
             by_key[r.key] = r
-    ordered = sorted(odds.items(), key=lambda kv: -kv[1])
-    out: list[Named] = []
-    rest = 0.0
-    for key, p in ordered:
-        special = not key or key == (("other", "-"),)
-        if len(out) >= 12 and not special:
-            rest += p
-            continue
+    ordered = sorted((odds | {OTHER: odds.get(OTHER, 0.0)}).items(), key=lambda kv: -kv[1])
+    out: dict[tuple[str, ...], list[Named]] = {}
+    for i, (key, p) in enumerate(ordered):
         effects = key if key else (("none", "-"),)
-        parameters: tuple[Any, ...] = ()
-        rival = by_key.get(key)
-        if rival is not None and p > 0.005:
-            if rival.hypothesis is not None:
-                for e in rival.hypothesis.effects:
-                    parameters += intervals(rival.hypothesis, e, max(analysis.scores.dispersion, 1.0), seed)
-            for e in rival.extra:
-                value = float(e.values[0])
-                parameters += ({"name": f"{e.cls}[{e.place}].{e.names[0]}", "unit": e.units[0], "q05": 0.9 * value, "q50": value,
-                                "q95": 1.1 * value},)
-        words = " and ".join(claim(e) for e in effects)
-        out.append(Named(effects, p, parameters, words, separates(effects, ordered)))
-    if rest > 0:
-        out = [Named(h.effects, h.probability + (rest if h.effects == (("other", "-"),) else 0.0), h.parameters, h.sentence, h.separated_by)
-               for h in out]
-    if not any(h.effects == (("other", "-"),) for h in out):
-        out.append(Named((("other", "-"),), rest, (), claim(("other", "-")), ROWS["other"].test))
-    return tuple(sorted(out, key=lambda h: -h.probability))
+        alike = out.setdefault(tuple(sorted(c for c, _ in effects)), [])
+        if alike and i >= LISTED and key and key != OTHER:
+            alike[0] = replace(alike[0], probability=alike[0].probability + p)
+            continue
+        parameters = _intervals(analysis, by_key[key], seed) if key in by_key and p > 0.005 else ()
+        alike.append(Named(effects, p, parameters, " and ".join(claim(e) for e in effects), separates(effects, ordered)))
+    return tuple(sorted((h for some in out.values() for h in some), key=lambda h: -h.probability))
+
+
+def _intervals(analysis: Analysis, rival: Rival, seed: int) -> tuple[dict[str, Any], ...]:
+    """Parameters of all effects of a rival."""
+    out: tuple[dict[str, Any], ...] = ()
+    for e in rival.hypothesis.effects if rival.hypothesis is not None else ():
+        out += intervals(rival.hypothesis, e, max(analysis.scores.dispersion, 1.0), seed)  # type: ignore[arg-type]
+    for e in rival.extra:
+        value = float(e.values[0])
+        out += ({"name": f"{e.cls}[{e.place}].{e.names[0]}", "unit": e.units[0], "q05": 0.9 * value, "q50": value, "q95": 1.1 * value},)
+    return out
 
 
 def _where(analysis: Analysis, odds: dict[Key, float], best: Rival | None) -> dict[str, Any]:

@@ -286,8 +286,11 @@ def claim(effect: tuple[str, str]) -> str:
 
 
 def rank(analysis: Analysis, layer: Layer) -> dict[Key, float]:
-    """Probability of every hypothesis."""
-    return probabilities(analysis.scores, layer)
+    """Probability of every hypothesis in the vocabulary of the case."""
+    known = {*analysis.case.classes, "other"}
+    odds = {key: p for key, p in probabilities(analysis.scores, layer).items() if all(cls in known for cls, _ in key)}
+    total = sum(odds.values())
+    return {key: p / total for key, p in odds.items()}
 
 
 __all__ = ["Analysis", "Named", "Proof", "Rival", "analyse", "claim", "diagnose", "intervals", "prove", "rank"]

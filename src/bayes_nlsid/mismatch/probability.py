@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Key = tuple[tuple[str, str], ...]
 STRANGE: Key = (("other", "-"),)
 MOST = 30  # rivals that are weighed; the rest are far behind
+PLACED = 0.5  # weight of the right place, given the right classes, in fitting the layer
 
 FEATURES = (
     "none", "other", "pair",                        # what kind of answer
@@ -55,19 +56,24 @@ class Layer:
     weights : tuple of float
         In the order of ``FEATURES``.
     provenance : str
+    reserve : float
+        Probability kept for classes, and for second effects beside the leader, that the search did not propose.
 
     Raises
     ------
     ValueError
-        If there is not one weight for every feature.
+        If there is not one weight for every feature, or the reserve is no probability.
     """
 
     weights: tuple[float, ...]
     provenance: str = "set by hand before any fit"
+    reserve: float = 0.03
 
     def __post_init__(self) -> None:
         if len(self.weights) != len(FEATURES):
             raise ValueError(f"weights: {len(self.weights)} numbers, one for each of the {len(FEATURES)} features are needed")
+        if not 0 <= self.reserve < 1:
+            raise ValueError(f"reserve: {self.reserve} is no probability")
 
     def weight(self, name: str) -> float:
         """Of one feature."""
@@ -222,9 +228,37 @@ def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float
     keys, table = features(scores)
     if len(keys) == 2 and not scores.unexplained > 0:
         return {(): 1.0}
-    weights = np.array((layer or SHIPPED).weights)
-    weight = _softmax(table @ weights + np.log([_prior(k) for k in keys]))
-    return {key: float(p) for key, p in sorted(zip(keys, weight, strict=True), key=lambda kv: -kv[1])}
+    layer = layer or SHIPPED
+    p = _softmax(table @ np.array(layer.weights) + np.log([_prior(k) for k in keys]))
+    missed = unproposed(keys, p)
+    reserve = layer.reserve if missed else 0.0
+    found = {key: (1 - reserve) * float(x) for key, x in zip(keys, p, strict=True)} | {k: reserve * share for k, share in missed.items()}
+    return dict(sorted(found.items(), key=lambda kv: -kv[1]))
+
+
+def unproposed(keys: Sequence[Key], p: Array) -> dict[Key, float]:
+    """Classes of the catalogue that are not among the hypotheses, alone and beside the leading effect: their shares of the reserve.
+
+    They stand where the leader stands if they can.
+    """
+    real = [(key, x) for key, x in zip(keys, p, strict=True) if key and key != STRANGE]
+    if not real:
+        return {}
+    leader = max(real, key=lambda kx: kx[1])[0]
+    beside = max(leader, key=lambda e: sum(x for key, x in real if e in key))
+    alone = {key[0][0] for key, _ in real if len(key) == 1}
+    second = {cls for key, _ in real if len(key) == 2 and beside in key for cls, _ in key if cls != beside[0]}
+    rows = [r for r in ROWS.values() if r.name not in ("none", "other")]
+    single: list[Key] = [((r.name, _stand(r.sits, beside)),) for r in rows if r.name not in alone]
+    pairs: list[Key] = [tuple(sorted((beside, (r.name, _stand(r.sits, beside))))) for r in rows if r.name not in second | {beside[0]}]
+    return {key: 0.5 / len(group) if single and pairs else 1 / len(group) for group in (single, pairs) for key in group}
+
+
+def _stand(sits: str, leader: tuple[str, str]) -> str:
+    """Where a class that sits so is put beside a leading effect."""
+    if sits in ("force", "base"):
+        return sits.upper()
+    return leader[1] if leader[0] in ROWS and ROWS[leader[0]].sits == sits else "-"
 
 
 def _prior(key: Key) -> float:
@@ -245,30 +279,65 @@ def fit_layer(scores: Sequence[Scores], truths: Sequence[Key], start: Layer | No
 
     Parameters
     ----------
-    truths : the true key of each case, empty for none; a truth that was not scored counts as ``other``.
+    truths : the true key of each case, empty for none.
     """
     from scipy.optimize import minimize
 
     limits = [(0.0 if name in AT_LEAST_ZERO else None, 0.0 if name in AT_MOST_ZERO else None) for name in FEATURES]
-    origin = np.array((start or BY_HAND).weights)
-    tables = []
-    for one, truth in zip(scores, truths, strict=True):
-        keys, table = features(one)
-        wanted = tuple(sorted(truth))
-        tables.append((table, np.log([_prior(k) for k in keys]), keys.index(wanted) if wanted in keys else keys.index(STRANGE)))
+    layer = start or BY_HAND
+    origin = np.array(layer.weights)
+    tables = [task_of(one, truth) for one, truth in zip(scores, truths, strict=True)]
 
     def loss(w: Array) -> tuple[float, Array]:
         total, gradient = 0.5 * float(((w - origin) ** 2).sum()) / spread ** 2, (w - origin) / spread ** 2
-        for table, prior, right in tables:
-            p = _softmax(table @ w + prior)
-            total -= float(np.log(max(p[right], 1e-300)))
-            gradient = gradient + p @ table - table[right]
+        for task in tables:
+            value, slope = task.loss(w, layer.reserve)
+            total, gradient = total + value, gradient + slope
         return total, gradient
 
     begin = np.clip(origin, [-np.inf if a is None else a for a, _ in limits], [np.inf if b is None else b for _, b in limits])
     best = minimize(loss, begin, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 500})
-    return replace(start or BY_HAND, weights=tuple(float(x) for x in best.x),
-                   provenance=provenance or f"fitted on {len(truths)} simulated cases")
+    return replace(layer, weights=tuple(float(x) for x in best.x), provenance=provenance or f"fitted on {len(truths)} simulated cases")
+
+
+@final
+@dataclass(frozen=True)
+class Task:
+    """One case to fit the layer on: features (H, F), logarithms of priors (H,), which hypotheses name the true classes (H,), which of these
+    is right in place too (or -1), and the share of the reserve that the truth has."""
+
+    table: Array
+    prior: Array
+    named: NDArray[np.bool_]
+    exact: int
+    share: float
+
+    def loss(self, w: Array, reserve: float) -> tuple[float, Array]:
+        """−log p of the true classes and, at half the weight, of the place given the classes; with the gradient in the weights."""
+        p = _softmax(self.table @ w + self.prior)
+        mean = p @ self.table
+        named = float(p[self.named].sum())
+        whole = (1 - reserve) * named + reserve * self.share + 1e-6
+        value, slope = -float(np.log(whole)), np.zeros_like(w)
+        if named > 0:
+            inside = p[self.named] @ self.table[self.named] / named
+            slope = -(1 - reserve) * named / whole * (inside - mean)
+            if self.exact >= 0:
+                value -= PLACED * float(np.log(max(p[self.exact], 1e-300) / named))
+                slope = slope - PLACED * (self.table[self.exact] - inside)
+        return value, slope
+
+
+def task_of(scores: Scores, truth: Key) -> Task:
+    """A case with its true key (empty for none)."""
+    keys, table = features(scores)
+    prior = np.log([_prior(k) for k in keys])
+    wanted = tuple(sorted(truth))
+    classes = tuple(sorted(cls for cls, _ in wanted))
+    named = np.array([tuple(sorted(cls for cls, _ in key)) == classes for key in keys])
+    missed = unproposed(keys, np.exp(prior))
+    share = sum(x for key, x in missed.items() if tuple(sorted(cls for cls, _ in key)) == classes)
+    return Task(table, prior, named, keys.index(wanted) if wanted in keys else -1, float(share))
 
 
 def _layer(provenance: str, **weights: float) -> Layer:
