@@ -16,6 +16,7 @@ from bayes_nlsid.mismatch.linear import Family
 Array = NDArray[np.float64]
 PSEUDO = 3.0        # sensors that the usual size of shape errors counts for
 GROUP_PSEUDO = 1.0  # errors that the usual size of a group counts for
+LARGEST = 10.0      # times the usual size: what is larger is no error of form, however well it would fit
 
 
 def groups(fam: Family) -> tuple[slice, ...]:
@@ -44,7 +45,8 @@ def likeliest_groups(fam: Family, theta: Array, normal: Array, gradient: Array, 
         best, variance = inverse @ target, np.maximum(np.diag(inverse), 0.0)   # rounding, where a parameter hardly matters
         for g in groups(fam):
             n = g.stop - g.start
-            sd[g] = np.sqrt((GROUP_PSEUDO * usual[g] ** 2 + (best[g] ** 2 + variance[g]).sum()) / (GROUP_PSEUDO + n))
+            size = np.sqrt((GROUP_PSEUDO * usual[g] ** 2 + (best[g] ** 2 + variance[g]).sum()) / (GROUP_PSEUDO + n))
+            sd[g] = np.minimum(size, LARGEST * usual[g])
     return sd
 
 
@@ -74,7 +76,7 @@ def likeliest_shapes(gram: Array, right: Array, spread: Array, usual: Array, rou
     for _ in range(rounds):
         inverse = np.linalg.inv(gram + np.eye(len(usual)) / spread ** 2)
         squares = (inverse @ right[..., None])[..., 0] ** 2 + np.einsum("smm->sm", inverse)
-        spread = np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram)))
+        spread = np.minimum(np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram))), LARGEST * usual)
     return np.asarray(spread)
 
 

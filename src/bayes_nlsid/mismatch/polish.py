@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 FAINT, FAINT_CHARGE = 0.01, 20.0  # change of response below which a linear effect is charged, and how much
 FAINT_LEAK = 0.03  # the same of crosstalk: a sensor some millimetres off its place picks up its neighbour's motion too
+POOR = 1.2  # cost per value from which a linear fit is no place to begin from
 WEAKER = 4  # starts that are tried, each half as strong as the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
@@ -176,12 +177,19 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     fam, evidence = bench.family, bench.evidence
     effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
     s, variance = evidence.spectra.s[evidence.excited], floored(evidence.H, evidence.variance)
-    begin = [_moved(start, x, candidates)]
-    if ext is not None and strained(fam, start.theta, sd):
+    spread = start.spread if start.status == "ok" else fam.error_sd    # a fit that failed has taken what it lacks for errors of form
+    begin = [(start.theta, x), _moved(start, x, candidates)]
+    if ext is not None and (start.cost > POOR * start.dof or strained(fam, start.theta, sd)):
         begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
-    ends = [descend(fam, t, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03, spread=start.spread) for t, y in begin]
+    first = sorted((descend(fam, t, s, evidence.H, variance, 0, prior_sd=sd, extension=ext, x=y, spread=spread) for t, y in begin),
+                   key=lambda e: e[2])
+    ends = []
+    for theta, y, _ in first:
+        ends.append(descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03, spread=spread))
+        if start.status == "ok" and ends[-1][2] < start.cost:
+            break
     theta, x, _ = min(ends, key=lambda e: e[2])
-    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=start.spread)
+    fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=spread)
     return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
 
 
@@ -200,7 +208,8 @@ def _prepared(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]
     effects = tuple(c.effect for c in candidates)
     kinds = tuple(kind_of(bench, c) for c in candidates if not c.effect.is_force and c.effect.cls != "linear_stiffness")
     ext = extension(kinds, len(bench.channels))
-    sd = widened(bench.family, start.sd, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
+    sizes = start.sd if start.status == "ok" else bench.family.prior_sd
+    sd = widened(bench.family, sizes, {e.place for e in effects if e.is_force or e.cls == "linear_stiffness"})
     x = np.zeros(0) if ext is None else ext.x
     if ext is not None and len(start.x) and len(start.x) <= len(x):
         x = np.concatenate([start.x, x[len(start.x):]])

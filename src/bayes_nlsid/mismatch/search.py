@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.effects import pack
+from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, estimate_linear, everywhere
@@ -74,6 +74,11 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         fit, estimates = _estimated(bench, fit, columns)
         none = bench.evidence.chi2 + fit.cost
         singles = _better(singles, estimates)
+        if estimates and none - estimates[0].cost > WORTH and singles[0].fit.cost > 1.02 * singles[0].fit.dof:
+            # a stiff relaxing branch has a column that is a poor guide: try one at every joint, if nothing simpler explains the data
+            centre = 1.5 * float(np.sqrt(band[0] * band[1]))
+            slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
+            singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
     singles, finished = _promising(bench, singles, short)
     if not linear_too and latents and singles and singles[0].misfit_records > 2 * bench.evidence.values:
         where = max(latents, key=lambda x: x.explained).place

@@ -71,7 +71,7 @@ def lines(found: Diagnosis) -> str:
     """The answer on one screen."""
     out = [f"{found.case}: {found.verdict} (probability of a mismatch {100 * found.p_mismatch:.0f} %)", found.sentence, ""]
     out += [f"  {100 * h.probability:5.1f} %  " + effects_of(h)
-            for h in found.hypotheses[:6]]
+            for i, h in enumerate(found.hypotheses[:6]) if i < 2 or h.probability > 0.005]
     held = found.heldout
     if held.get("nrmse_extended") is not None:
         out.append(f"\non {', '.join(held['records'])}: NRMSE {100 * held['nrmse_nominal']:.3g} % as delivered, "
