@@ -46,6 +46,15 @@ def propagators(omega: Array, zeta: Array, dt: float) -> tuple[Array, Array]:
     return np.ascontiguousarray(own), forced
 
 
+@compiled
+def _add_force(state: np.ndarray, b: np.ndarray, forced: np.ndarray, force: np.ndarray, sign: float) -> None:
+    """Add to (or take from) the state what the force after a step gives to it."""
+    for j in range(len(b)):
+        for m in range(b.shape[1]):
+            state[0, m] += sign * forced[1, m] * b[j, m] * force[j]
+            state[1, m] += sign * forced[3, m] * b[j, m] * force[j]
+
+
 @partial(compiled, fastmath={"contract", "reassoc", "nsz"})
 def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndarray, b: np.ndarray, yielding: np.ndarray,
                 codes: np.ndarray, powers: np.ndarray, values: np.ndarray, g: np.ndarray, state: np.ndarray, before: np.ndarray) -> int:
@@ -87,22 +96,35 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
             for m in range(modes):
                 direct_q[j, k] += b[j, m] * b[k, m] * forced[1, m]
                 direct_v[j, k] += b[j, m] * b[k, m] * forced[3, m]
+    # the state is carried without what the last force adds to it, so that one sweep over the modes serves a step
+    pushed, moved = np.empty(modes), np.empty(modes)
+    for m in range(modes):
+        pushed[m] = own[0, m] * forced[1, m] + own[1, m] * forced[3, m] + forced[0, m]
+        moved[m] = own[2, m] * forced[1, m] + own[3, m] * forced[3, m] + forced[2, m]
     q, v, x, old, older = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
     for j in range(places):
         old[j] = older[j] = before[j]
+    _add_force(state, b, forced, old, -1.0)
     lost, largest = 0, 1e-300
     for i in range(count):
         qa, va, qb, vb = 0.0, 0.0, 0.0, 0.0
-        ua, ub = old[0], old[1] if last else 0.0
-        for m in range(modes):
-            u = b[0, m] * ua + b[last, m] * ub
-            a, c = state[0, m], state[1, m]
-            here, speed = own[0, m] * a + own[1, m] * c + forced[0, m] * u, own[2, m] * a + own[3, m] * c + forced[2, m] * u
-            state[0, m], state[1, m] = here, speed
-            qa += b[0, m] * here
-            va += b[0, m] * speed
-            qb += b[last, m] * here
-            vb += b[last, m] * speed
+        ua, ub = old[0], old[1]
+        if last:
+            for m in range(modes):
+                u, a, c = b[0, m] * ua + b[1, m] * ub, state[0, m], state[1, m]
+                here, speed = own[0, m] * a + own[1, m] * c + pushed[m] * u, own[2, m] * a + own[3, m] * c + moved[m] * u
+                state[0, m], state[1, m] = here, speed
+                qa += b[0, m] * here
+                va += b[0, m] * speed
+                qb += b[1, m] * here
+                vb += b[1, m] * speed
+        else:
+            for m in range(modes):
+                u, a, c = b[0, m] * ua, state[0, m], state[1, m]
+                here, speed = own[0, m] * a + own[1, m] * c + pushed[m] * u, own[2, m] * a + own[3, m] * c + moved[m] * u
+                state[0, m], state[1, m] = here, speed
+                qa += b[0, m] * here
+                va += b[0, m] * speed
         q[0], q[1], v[0], v[1] = qa, qb, va, vb
         for j in range(places):
             q[j], v[j], x[j] = q0[i, j] - q[j], v0[i, j] - v[j], 2.0 * old[j] - older[j]
@@ -130,9 +152,5 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
         lost += 0 if solved else 1
         for j in range(places):
             g[i, j], old[j], older[j] = x[j], x[j], old[j]
-        ua, ub = x[0], x[1] if last else 0.0
-        for m in range(modes):
-            u = b[0, m] * ua + b[last, m] * ub
-            state[0, m] += forced[1, m] * u
-            state[1, m] += forced[3, m] * u
+    _add_force(state, b, forced, old, 1.0)
     return lost
