@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from bayes_nlsid.mismatch.calibrate import LinearFit, calibrate
 from bayes_nlsid.mismatch.case import Case, CaseRecord, read_case
 from bayes_nlsid.mismatch.catalogue import ROWS
+from bayes_nlsid.mismatch.cell import Heard, heard, straightened, without
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
-from bayes_nlsid.mismatch.disturb import disturbances, without_hum
+from bayes_nlsid.mismatch.disturb import Disturbance, disturbances, without_hum
 from bayes_nlsid.mismatch.effects import Effect, pack, unpack
 from bayes_nlsid.mismatch.evidence import Evidence, gather, level_transfer
 from bayes_nlsid.mismatch.explain import sizes
@@ -37,9 +38,13 @@ Progress = Callable[[str], None]
 @final
 @dataclass(frozen=True)
 class Analysis:
-    """Everything found in a case before it is put into words; what the probability layer is fitted on."""
+    """Everything found in a case before it is put into words; what the probability layer is fitted on.
+
+    ``as_read``: the case before the curve of a bent force cell was straightened (mostly the same).
+    """
 
     case: Case
+    as_read: Case
     evidence: Evidence
     family: Family
     fit: LinearFit
@@ -90,17 +95,35 @@ def analyse(case: Case, say: Progress) -> Analysis:
     say("calibrating the linear model")
     linear = not evidence.statistic > 1.1
     fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=6 if linear else 2)
+    as_read = case
+    between = heard(spectra, fam, fit, case.band)
+    if between is not None and between.real:
+        spectra = without(spectra, between)
+        evidence = gather(spectra, case.band, case.mains)
+    elif between is not None and (straight := straightened(case, spectra)) is not None:
+        case = straight
+        spectra, held, floor = _groups(without_hum(case, spectra), [])
+        evidence = gather(spectra, case.band, case.mains)
+        fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=2)
     bench = _bench(case, fam, fit, evidence)
     say("searching laws, places and channels")
     places = list(fam.places)
     found = search(bench, fit, places, case.band, say, () if linear else _one_level(fam, evidence))
     fit = found.fit
-    noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes)
+    noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes) + cell_fault(case, between)
     rivals = all_rivals(case, bench, fit, found, floor, noisy, say)
     say("running the leading explanations on records that were not used")
     rivals, held_none = on_trial(case, bench, fit, rivals, held, floor)
-    return Analysis(case, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals, held_none), found, held, floor,
+    return Analysis(case, as_read, evidence, fam, fit, tuple(rivals), _scores(evidence, fit, found, rivals, held_none), found, held, floor,
                     tuple(notes))
+
+
+def cell_fault(case: Case, between: Heard | None) -> list[Disturbance]:
+    """Force that only the cell reads, as a disturbance as large as the response it should have had."""
+    if between is None or between.real:
+        return []
+    loudest = max((r for r in case.records if not r.sealed and r.kind != "off"), key=lambda r: r.level).accel[:, case.usable]
+    return [Disturbance("other", "FORCE", between.gain, between.size * float(np.sqrt(np.mean(loudest ** 2))), "curve of the force cell")]
 
 
 def _groups(case: Case, notes: list[str]) -> tuple[Spectra, tuple[CaseRecord, ...], Array]:
@@ -258,7 +281,9 @@ def prove(analysis: Analysis, rival: Rival | None) -> tuple[Proof, Predictor]:
     if not held:
         held = tuple(r for r in case.records if not r.sealed and r.kind != "off")[:1]
     measured = [r.accel[:, case.usable] for r in held]
-    runs = {name: [p.run(case, r) for r in held] for name, p in (("nominal", nominal), ("updated", updated), ("extended", extended))}
+    read = {r.name: r for r in analysis.as_read.records}    # a bent cell is missing from the nominal model and from the re-tuned one
+    runs = {name: [p.run(case, read[r.name] if name != "extended" else r) for r in held]
+            for name, p in (("nominal", nominal), ("updated", updated), ("extended", extended))}
     waves = {name: [w for w, _ in many] for name, many in runs.items()}
     bad = any(not np.isfinite(w).all() for w in waves["extended"]) or any(s != "ok" for _, s in runs["extended"])
     errors = {name: float(np.sqrt(sum(((m - w) ** 2).sum() for m, w in zip(measured, many, strict=True))
@@ -269,7 +294,8 @@ def prove(analysis: Analysis, rival: Rival | None) -> tuple[Proof, Predictor]:
     chosen, name = (updated, "updated") if withdrawn else (extended, "extended")
     bands = calibrate_bands(analysis.noise, measured, waves[name], case.rate)
     first = calibrate_bands(analysis.noise, measured, waves["updated"], case.rate)
-    elpd, se = (0.0, 0.0) if chosen is updated else elpd_difference(np.concatenate(measured), np.concatenate(waves["updated"]),
+    alike = all(np.array_equal(a, b) for a, b in zip(waves[name], waves["updated"], strict=True))
+    elpd, se = (0.0, 0.0) if alike else elpd_difference(np.concatenate(measured), np.concatenate(waves["updated"]),
                                                                     np.concatenate(waves[name]), first, bands, case.rate)
     y, p = np.concatenate(measured), np.concatenate(waves[name])
     coverage = float((np.abs(y - p) < bands.factor * bands.sd(p, case.rate)).mean())

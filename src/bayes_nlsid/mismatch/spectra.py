@@ -7,7 +7,7 @@ linear path from rest, and brings the end of the record below the noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -52,6 +52,8 @@ class Spectra:
     scatter : ndarray complex (Q, L, S)
         Deviations of single periods from their mean, scaled to the variance of one period (Q = 0 for bursts).
     levels, starts : ndarray (R,)
+    stray : ndarray complex (R, L)
+        Force that stands out of its noise on lines the excitation leaves out; zero elsewhere (and for bursts).
     """
 
     names: tuple[str, ...]
@@ -69,12 +71,17 @@ class Spectra:
     scatter: Complex
     levels: Array
     starts: Array
+    stray: Complex = field(default_factory=lambda: np.zeros((0, 0), dtype=complex))
 
     def __post_init__(self) -> None:
         r, length = self.force.shape
         if self.response.shape[:2] != (r, length) or self.noise.shape != self.response.shape or self.lines.shape != (length,):
             raise ValueError(f"force {self.force.shape}, response {self.response.shape}, noise {self.noise.shape}, lines "
                              f"{self.lines.shape} disagree")
+        if self.stray.shape != self.force.shape:
+            if self.stray.size:
+                raise ValueError(f"stray has shape {self.stray.shape}, that of force is {self.force.shape}")
+            object.__setattr__(self, "stray", np.zeros_like(self.force))
 
     @property
     def frequency(self) -> Array:
@@ -117,12 +124,13 @@ def steady_spectra(case: Case, records: tuple[CaseRecord, ...], floor: Array | N
     one = np.maximum(one, 1e-14 * (np.abs(response) ** 2).mean())
     count = np.array([r.periods for r in records], dtype=float)
     excited = _excited_lines(case, force, one_force / count.mean())
+    stray = np.where(excited | (np.abs(force) ** 2 < 20 * one_force / count[:, None]), 0, force)
     force = np.where(excited, force, 0)
     waveforms = np.fft.irfft(np.where(np.arange(block // 2 + 1) <= last, force, 0) * block, block, axis=1)
     return Spectra(tuple(r.name for r in records), "steady", block, case.rate, 0.0, lines, excited[lines], force[:, lines],
                    response[:, lines], one[lines] / count[:, None, None], one_force[lines] / count[:, None], waveforms,
                    np.array(scatter)[:, lines] if scatter else np.zeros((0, len(lines), response.shape[2]), dtype=complex),
-                   np.array([r.level for r in records]), np.array([r.start for r in records]))
+                   np.array([r.level for r in records]), np.array([r.start for r in records]), stray[:, lines])
 
 
 def burst_spectra(case: Case, records: tuple[CaseRecord, ...], psd: Array, most: int = 1200) -> Spectra:
