@@ -73,9 +73,12 @@ def test_the_curve_of_a_bent_cell_is_straightened(tmp_path: Path) -> None:
     assert found is not None and not found.real and found.gain > 1000
     straight = straightened(case, spectra)
     assert straight is not None
+    loudest = max(straight.records, key=lambda r: float(r.force.std()))
+    # a curve is known from what it makes between the lines but for a factor, which is the gain of the cell
+    factor = float(true[loudest.name] @ loudest.force / (loudest.force @ loudest.force))
+    assert factor == pytest.approx(1.0, abs=0.01)
     for bent, record in zip(case.records, straight.records, strict=True):
         force = true[record.name]
         if np.abs(force).max() > 0:
-            def error(f: np.ndarray, force: np.ndarray = force) -> float:
-                return float(np.std(f - force) / np.std(force))
-            assert error(record.force) < max(0.1 * error(bent.force), 0.002), record.name
+            left, before = (np.std(f - force) / np.std(force) for f in (factor * record.force, bent.force))
+            assert left < max(0.1 * before, 0.001), record.name
