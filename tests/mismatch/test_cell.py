@@ -81,4 +81,4 @@ def test_the_curve_of_a_bent_cell_is_straightened(tmp_path: Path) -> None:
         force = true[record.name]
         if np.abs(force).max() > 0:
             left, before = (np.std(f - force) / np.std(force) for f in (factor * record.force, bent.force))
-            assert left < max(0.1 * before, 0.001), record.name
+            assert left < max(0.1 * before, 0.003), record.name
