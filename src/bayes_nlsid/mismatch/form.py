@@ -16,7 +16,8 @@ from bayes_nlsid.mismatch.linear import Family
 Array = NDArray[np.float64]
 PSEUDO = 3.0        # sensors that the usual size of shape errors counts for
 GROUP_PSEUDO = 1.0  # errors that the usual size of a group counts for
-LARGEST = 10.0      # times the usual size: what is larger is no error of form, however well it would fit
+LARGEST = 10.0      # times the usual size of a group: what is larger is no error of form, however well it would fit
+LARGEST_SHAPE = 30.0    # the same of one mode's shape: some per cent, as a sensor in the wrong place makes them
 
 
 def groups(fam: Family) -> tuple[slice, ...]:
@@ -76,7 +77,7 @@ def likeliest_shapes(gram: Array, right: Array, spread: Array, usual: Array, rou
     for _ in range(rounds):
         inverse = np.linalg.inv(gram + np.eye(len(usual)) / spread ** 2)
         squares = (inverse @ right[..., None])[..., 0] ** 2 + np.einsum("smm->sm", inverse)
-        spread = np.minimum(np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram))), LARGEST * usual)
+        spread = np.minimum(np.sqrt((PSEUDO * usual ** 2 + squares.sum(axis=0)) / (PSEUDO + len(gram))), LARGEST_SHAPE * usual)
     return np.asarray(spread)
 
 
