@@ -98,6 +98,18 @@ def test_ctrl_c_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     assert "run the same command again" in capsys.readouterr().err
 
 
+def test_too_little_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    import bayes_nlsid.study.screen as screen
+
+    def greedy() -> str:
+        raise MemoryError("Unable to allocate 46 TiB")
+
+    monkeypatch.setattr(screen, "terms_table", greedy)
+    assert main(["terms"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "46 TiB" in said.err and "fewer degrees of freedom" in said.err
+
+
 def test_nothing_but_the_summary_without_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str],
                                                     monkeypatch: pytest.MonkeyPatch) -> None:
     from bayes_nlsid.study import pictures

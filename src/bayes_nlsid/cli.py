@@ -30,6 +30,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"nlsid: {error}", file=sys.stderr)
         return BAD_INPUT
+    except MemoryError as error:
+        print(f"nlsid: the memory of this machine is not enough ({str(error) or 'no more is said'}); ask for fewer degrees of freedom, "
+              "modes or samples.", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("\nnlsid: stopped; run the same command again to go on from here.", file=sys.stderr)
         return STOPPED

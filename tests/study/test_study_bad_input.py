@@ -19,6 +19,9 @@ CASES = {
     "text for a number": ("mass = 1.0 ", 'mass = "heavy" ', ["[structure] mass", "does not begin with a number"]),
     "wrong dimension": ('frequency = "20 Hz"', 'frequency = "20 mm"', ["[structure] frequency", "'mm' is not a unit of frequency",
                                                                        "Hz, kHz"]),
+    "text without unit": ('frequency = "20 Hz"', 'frequency = "20"', ["[structure] frequency", "'20' is a text without a unit",
+                                                                      "write 20 without quotes", "Hz, kHz"]),
+    "unit of a plain number": ("starts = 20", 'starts = 20\nwidening = "2 m"', ["[identification] widening", "'m' is not understood here"]),
     "negative mass": ("mass = 1.0 ", "mass = -1.0 ", ["[structure] mass", "not positive"]),
     "both stiffness and frequency": ("mass = 1.0 ", "stiffness = 3.0\nmass = 1.0 ", ["[structure] stiffness", "give one of them"]),
     "no title": ('title = "My first study: an oscillator with a hardening spring"', "", ["title: is missing"]),
@@ -189,6 +192,10 @@ def test_units_become_si(tmp_path: Path) -> None:
      "[linear] update: 'J4_slip' is not a part of the structure; did you mean 'J"),
     ("[[recordings]]", '[linear]\nrecording = "recording"\n[linear.update]\na = ["J1_slip"]\nb = ["J1_slip"]\n[[recordings]]',
      "[linear] update: 'J1_slip' stands in two groups"),
+    ('length = "720 mm"', 'length = "720 mm"\nelement_size = "1 um"', "[structure]: lapped beam: elements of 1e-06 m are 7.2e+05 along it"),
+    ("[[recordings]]", '[reduction]\ndamping = "120 %"\n[[recordings]]', "[reduction] damping: 1.2 is not below critical damping"),
+    ("[[recordings]]", '[linear]\nrecording = "recording"\n[linear.update]\na = []\n[[recordings]]',
+     "[linear] update: group 'a' names no parts"),
     ('"330 mm", "360 mm", "390 mm"', '"130 mm", "360 mm", "390 mm"', "must lie within the lap"),
 ])
 def test_bad_beams(right: str, wrong: str, expected: str, tmp_path: Path) -> None:

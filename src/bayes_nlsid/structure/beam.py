@@ -17,6 +17,10 @@ Positions = tuple[tuple[str, float], ...]
 _DIRECTIONS = ("u", "w", "rot")
 
 
+MOST_ELEMENTS = 1000
+"""Along the length; matrices are full, so that more would take gigabytes."""
+
+
 @final
 @dataclass(frozen=True)
 class LappedBeam:
@@ -61,7 +65,7 @@ class LappedBeam:
     Raises
     ------
     ValueError
-        If a size is not positive, a position lies off the beam or a station off the lap, or counts disagree.
+        If a size is not positive, elements are too many, a position lies off the beam or a station off the lap, or counts disagree.
     """
 
     length: float
@@ -91,6 +95,9 @@ class LappedBeam:
         for name in ("length", "width", "height", "E", "rho", "element_size"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"lapped beam: {name} must be positive, got {getattr(self, name)}")
+        if self.length > MOST_ELEMENTS * self.element_size:
+            raise ValueError(f"lapped beam: elements of {self.element_size:g} m are {self.length / self.element_size:.3g} along it, "
+                             f"at most {MOST_ELEMENTS} are possible")
         if not -1 < self.nu < 0.5 or (self.G is not None and self.G <= 0) or (self.shear_factor is not None and self.shear_factor <= 0):
             raise ValueError("lapped beam: nu must lie in (-1, 0.5), G and shear_factor must be positive")
         places = [x for _, x in (*self.sensors, *self.inputs, *self.points)] + [x for x, _ in self.bolts] + [x for _, x, _ in self.masses]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,8 +45,8 @@ def build_structure(entry: StructureEntry) -> Structure | ModalModel:
     return read_matrices(**files, **values)
 
 
-def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -> ModalModel:
-    """The modal model that identification works with, reduced as the study says.
+def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry, file: Path) -> ModalModel:
+    """The modal model that identification works with, reduced as the study in ``file`` says.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def reduce_structure(structure: Structure | ModalModel, entry: ReductionEntry) -
                    else iirs(structure, masters, iterations=entry.iterations, guard="constrain"))
         return _guessed(modal_model(reduced, modes), entry.damping)
     except ValueError as error:
-        raise InputError("[reduction] masters", str(error), "name more masters, or fewer modes") from None
+        raise InputError(f"{file.name}: [reduction] masters", str(error), "name more masters, or fewer modes") from None
 
 
 def _guessed(model: ModalModel, damping: float | None) -> ModalModel:

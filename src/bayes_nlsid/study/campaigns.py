@@ -44,7 +44,7 @@ def campaign_of(study: Study) -> Campaign:
     """
     notes: list[str] = []
     recordings = _readable(study, notes)
-    nominal = reduce_structure(build_structure(study.structure), study.reduction)
+    nominal = reduce_structure(build_structure(study.structure), study.reduction, study.file)
     start = _calibrated(study, nominal, recordings, notes)
     judged = [r for r in recordings if r.role == "holdout"]
     fitted = [r for r in recordings if r.role == "train"]

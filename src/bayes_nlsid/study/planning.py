@@ -61,7 +61,7 @@ def run_plan(study: Study, out: Path, *, seed: int | None = None, progress: Call
 
 
 def _compute(study: Study, entry: PlanEntry, seed: int, progress: Callable[[float, str], None] | None) -> MeasurementPlan:
-    linear = reduce_structure(build_structure(study.structure), study.reduction)
+    linear = reduce_structure(build_structure(study.structure), study.reduction, study.file)
     stated = study.linear.damping[:linear.modes]
     if stated:
         linear = replace(linear, zeta=np.concatenate([stated, linear.zeta[len(stated):]]))

@@ -54,6 +54,9 @@ def quantity(value: object, dimension: str, where: str) -> float:
     if match is None:
         raise InputError(where, f"{value!r} does not begin with a number", f"write a number{_example(dimension)}")
     number, unit = float(match.group(1)), match.group(2)
+    if not unit and (dimension in _SENSED or _TABLES[dimension]) and dimension != "ratio":
+        raise InputError(where, f"{value!r} is a text without a unit", f"write {value.strip()} without quotes for SI, or add its unit "
+                         f"({units_of(dimension)})")
     if not unit:
         return _finite(number, where)
     return _finite(number * _factor(unit, dimension, where), where)
@@ -67,8 +70,9 @@ def _factor(unit: str, dimension: str, where: str) -> float:
             raise InputError(where, f"unit {unit!r} {error.problem}", error.mend) from None
     factor = _TABLES[dimension].get(" ".join(unit.replace("²", "^2").replace("³", "^3").replace("µ", "u").replace("·", " ").split()))
     if factor is None:
-        allowed = f"use one of {units_of(dimension)}" if _TABLES[dimension] else "write the bare number"
-        raise InputError(where, f"unit {unit!r} is not a unit of {dimension}", allowed)
+        if not _TABLES[dimension]:
+            raise InputError(where, f"unit {unit!r} is not understood here", "write the bare number, in SI")
+        raise InputError(where, f"unit {unit!r} is not a unit of {dimension}", f"use one of {units_of(dimension)}")
     return factor
 
 

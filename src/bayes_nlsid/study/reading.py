@@ -206,7 +206,11 @@ def _read_update(table: Table) -> tuple[tuple[str, tuple[str, ...]], ...]:
     if not isinstance(table.raw("update", None), dict):
         return tuple((name, (name,)) for name in table.texts("update", ()))
     inner = table.table("update")
-    return () if inner is None else tuple((key, inner.texts(key)) for key in inner.keys())
+    groups = () if inner is None else tuple((key, inner.texts(key)) for key in inner.keys())
+    for key, parts in groups:
+        if not parts:
+            raise table.wrong("update", f"group {key!r} names no parts", "name parts of the structure, or remove the group")
+    return groups
 
 
 def _read_modal_test(table: Table, recording: str | None, locations: Sequence[str]) -> tuple[Path | None, tuple[tuple[str, str], ...]]:

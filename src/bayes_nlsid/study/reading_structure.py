@@ -153,6 +153,8 @@ def read_reduction(table: Table | None, structure: StructureEntry) -> ReductionE
     masters = table.texts("masters", GROUPS)
     entry = ReductionEntry(method, masters, table.integer("modes", None, low=1), table.integer("iterations", 30, low=1),
                            table.number("damping", "ratio", None, positive=True))
+    if entry.damping is not None and entry.damping >= 1:
+        raise table.wrong("damping", f"{entry.damping:g} is not below critical damping", 'write a ratio such as 0.001 or "0.1 %"')
     if method == "none" and table.has("masters"):
         raise table.wrong("masters", "is given, but method is none",
                           f"write a method ({nearest('iirs', ('guyan', 'iirs'))}), or remove masters")

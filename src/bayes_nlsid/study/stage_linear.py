@@ -29,7 +29,7 @@ def linear(context: Context) -> Result:
     study = context.study
     context.progress(0.0, "building the structure")
     structure = build_structure(study.structure)
-    nominal = reduce_structure(structure, study.reduction)
+    nominal = reduce_structure(structure, study.reduction, study.file)
     if study.linear.recording is None and study.linear.file is None:
         model = _with_stated_damping(context, nominal)
         arrays, names = model_record(model)
@@ -45,7 +45,7 @@ def linear(context: Context) -> Result:
         context.note(sentence)
     final, updated, notes = _updated(context, structure, measured)
     context.progress(0.8, "reducing")
-    computed = reduce_structure(final, study.reduction)
+    computed = reduce_structure(final, study.reduction, study.file)
     model = _with_stated_damping(context, _measured_into(computed, measured, study.linear.use_measured))
     arrays, names = model_record(model)
     table, extra = _compare(measured, nominal, computed)
@@ -131,7 +131,8 @@ def _shape_lines(context: Context, updated: list[dict[str, Any]], modes: list[in
     assert isinstance(structure, Structure)
     if updated:
         structure = structure.scaled({part: row["factor"] for row in updated for part in row["parts"]})
-    fine = reduce_structure(structure, replace(context.study.reduction, method="none", masters=(), modes=max(modes) + 1))
+    whole = replace(context.study.reduction, method="none", masters=(), modes=max(modes) + 1)
+    fine = reduce_structure(structure, whole, context.study.file)
     return {"line_position": x, "line": fine.rows([f"shape {i}" for i in range(len(x))])[:, modes]}
 
 
