@@ -179,7 +179,8 @@ def _mass_scale(case: Case) -> float:
 
 
 def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival], held_none: float) -> Scores:
-    items = tuple(Score(r.key, float(r.gain), float(r.alone), r.strength, r.visible, r.rest, r.held, r.faint) for r in rivals)
+    items = tuple(Score(r.key, float(r.gain), float(r.alone), r.strength, r.visible, r.rest, r.held, r.faint, bool(r.extra) and not r.clip)
+                  for r in rivals)
     best = next((r.hypothesis for r in rivals if r.hypothesis is not None), None)
     total = evidence.values + fit.dof
     leftover = found.none if best is None else best.misfit_records + best.fit.cost

@@ -337,9 +337,16 @@ def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[floa
 
 
 def _paired(bench: Bench, start: LinearFit, pair: tuple[Candidate, ...]) -> Hypothesis:
-    """Joint estimation of a pair whose first member is known."""
+    """Joint estimation of a pair whose first member is known.
+
+    A linear effect beside a law is first estimated on the transfer function that the law leaves, the law held.
+    """
     if not any(c.effect.is_force for c in pair):
         return estimate(bench, start, pair)
+    linear = tuple(c for c in pair if not c.effect.is_force)
+    if len(linear) == 1 and not len(start.x):
+        left = replace(bench, evidence=replace(bench.evidence, H=start.measured, variance=start.variance))
+        start = estimate_linear(left, start, linear).fit
     return refine(bench, begin(bench, start, pair, steps=1, weaker=0), steps=4, quick=True)
 
 
