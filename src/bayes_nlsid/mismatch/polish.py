@@ -31,6 +31,7 @@ Complex = NDArray[np.complex128]
 FAINT, FAINT_CHARGE = 0.01, 20.0  # change of response below which a linear effect is charged, and how much
 FAINT_LEAK = 0.03  # the same of crosstalk: a sensor some millimetres off its place picks up its neighbour's motion too
 POOR = 1.2  # cost per value from which a linear fit is no place to begin from
+FOLLOWED = 10  # steps from each of several starts
 WEAKER = 4  # starts that are tried, each half as strong as the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
@@ -181,14 +182,16 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     begin = [(start.theta, x), _moved(start, x, candidates)]
     if ext is not None and (start.cost > POOR * start.dof or strained(fam, start.theta, sd)):
         begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
-    first = sorted((descend(fam, t, s, evidence.H, variance, 0, prior_sd=sd, extension=ext, x=y, spread=spread) for t, y in begin),
-                   key=lambda e: e[2])
-    ends = []
-    for theta, y, _ in first:
-        ends.append(descend(fam, theta, s, evidence.H, variance, 30, prior_sd=sd, extension=ext, x=y, tol=0.03, spread=spread))
-        if start.status == "ok" and ends[-1][2] < start.cost:
-            break
-    theta, x, _ = min(ends, key=lambda e: e[2])
+
+    def onward(at: tuple[Array, Array], steps: int) -> tuple[Array, Array, float]:
+        return descend(fam, at[0], s, evidence.H, variance, steps, prior_sd=sd, extension=ext, x=at[1], tol=0.03, spread=spread)
+
+    # from a fit that is sound the nearest start leads on; where it is not, each is followed some way
+    first = sorted((onward(at, 0 if start.status == "ok" else FOLLOWED) for at in begin), key=lambda e: e[2])
+    end = onward(first[0][:2], 30)
+    if start.status == "ok" and not end[2] < start.cost:
+        end = min((end, *(onward(at[:2], 30) for at in first[1:])), key=lambda e: e[2])
+    theta, x, _ = end
     fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=spread)
     return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
 

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
 SECOND = 25.0  # the same for a second effect
+FIRST_FEW = 2  # linear effects that are estimated first from a linear fit that is no good
 CLEAR = 1000.0  # gain of a linear effect that its column promises nearly rightly
 KINDS = (("hardening", "softening", "clearance", "asymmetric"), ("coulomb", "quad_damping"), ("hysteresis",))
 CHARGED = 6.0  # the same for each parameter: less than what it will be charged
@@ -71,7 +72,7 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     if linear_too:
         columns = _short_linear(linear)
         say(f"estimating {len(columns)} linear effects")
-        fit, estimates = _estimated(bench, fit, columns)
+        fit, estimates = _estimated(bench, fit, band, columns)
         none = bench.evidence.chi2 + fit.cost
         singles = _better(singles, estimates)
         if estimates and none - estimates[0].cost > WORTH and singles[0].fit.cost > 1.02 * singles[0].fit.dof:
@@ -102,16 +103,22 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     return Found(none, fit, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
 
 
-def _estimated(bench: Bench, fit: LinearFit, columns: list[Candidate]) -> tuple[LinearFit, list[Hypothesis]]:
+def _estimated(bench: Bench, fit: LinearFit, band: tuple[float, float], columns: list[Candidate]) -> tuple[LinearFit, list[Hypothesis]]:
     """Linear effects estimated, and the linear model alone calibrated again from where the best of them have left it: an effect that
-    only leads it out of a side valley explains nothing."""
+    only leads it out of a side valley explains nothing.
+
+    From a linear fit that is no good every estimate is long and all but one are in vain: there the first few lead the way.
+    """
     found: list[Hypothesis] = []
     for _ in range(3):
-        found = _better(found, [estimate(bench, fit, (c,)) for c in columns])
+        few = columns[:FIRST_FEW] if fit.status != "ok" else columns
+        found = _better(found, [estimate(bench, fit, (c,)) for c in few])
         again = min((estimate_linear(bench, h.fit, ()).fit for h in found[:2]), key=lambda f: f.cost, default=fit)
         if not again.cost < fit.cost - 3.0:
+            found = _better(found, [estimate(bench, fit, (c,)) for c in columns[len(few):]])
             break
         fit = again
+        columns = _short_linear(scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)) or columns
     return fit, found
 
 
