@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RELATIVE_FLOOR = 2e-4  # of any model of this kind
 LONGEST = 1.5  # step of any parameter
+NEAR = 20.0  # cost per value from which full steps may lead on
 
 
 @final
@@ -303,7 +304,7 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
         # along a valley each damped step gains little: what is left to gain decides, not what the last step gained
         if here.promise < tol * max(1.0, 1e-3 * here.cost):
             break
-        ahead = _ahead(at, here)
+        ahead = _ahead(at, here) if here.cost < NEAR * 2 * measured.size else None
         if ahead is None:
             ahead, damping = _damped(at, here, damping)
         if ahead is None:
@@ -331,7 +332,7 @@ def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: A
         theta, x, cost = descend(fam, theta, s, measured, variance, 2, prior_sd=sd, extension=extension, x=x, tol=0.1, spread=spread)
         system = assemble(fam, theta, x, s, measured, variance, extension, spread=spread)
         cost += groups_price(fam, system.normal + own, sd)
-        if before - cost < 1.0:
+        if before - cost < max(1.0, 1e-4 * cost):
             break
         before = cost
     fld, chain = predict(fam, theta, s, extension, x)

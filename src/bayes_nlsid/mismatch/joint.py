@@ -105,16 +105,17 @@ class Joint:
         return float((np.abs(point.residual) ** 2).sum()) + system.chi2 + prior
 
 
-def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]) -> Hypothesis:
+def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], beat: float = np.inf) -> Hypothesis:
     """Joint estimation of up to two effects with the linear model.
 
     Parameters
     ----------
     start : linear fit to begin from.
     candidates : effects with starting values from the first search.
+    beat : see ``estimate_linear``.
     """
     if not any(c.effect.is_force for c in candidates):
-        return estimate_linear(bench, start, candidates)
+        return estimate_linear(bench, start, candidates, beat)
     return pursue(bench, begin(bench, start, candidates))
 
 

@@ -237,10 +237,12 @@ def fields(fam: Family, modes: Modes, s: Complex, attach: tuple[Attachment, ...]
 
 def _corrected(fam: Family, fld: Fields, s: Complex) -> Fields:
     """Coupling of the modes by dashpots added to the accelerance, to first order."""
-    at = np.flatnonzero(fld.modes.viscous)
-    if len(at) == 0:
+    if not fld.modes.viscous.any():
         return fld
-    return replace(fld, H=fld.H + np.tensordot(fld.modes.viscous[at], dashpot_columns(fam, fld, s, at), 1))
+    rows = fam.dashpots @ fld.modes.basis[:, :fld.right.shape[1]]
+    between = (rows.T * fld.modes.viscous) @ rows
+    np.fill_diagonal(between, 0.0)      # what they do to each mode's own damping has its own deviation already
+    return replace(fld, H=fld.H - (s ** 3)[:, None] * (fld.left @ (fld.right @ between)[:, :, None])[:, :, 0])
 
 
 def dashpot_columns(fam: Family, fld: Fields, s: Complex, at: NDArray[np.intp]) -> Complex:

@@ -31,7 +31,8 @@ Complex = NDArray[np.complex128]
 FAINT, FAINT_CHARGE = 0.01, 20.0  # change of response below which a linear effect is charged, and how much
 FAINT_LEAK = 0.03  # the same of crosstalk: a sensor some millimetres off its place picks up its neighbour's motion too
 POOR = 1.2  # cost per value from which a linear fit is no place to begin from
-FOLLOWED = 10  # steps from each of several starts
+FOLLOWED, THIN = 10, 4  # steps from each of several starts, and of how many lines one counts there
+HOPELESS = 4.0  # times the cost of a rival
 WEAKER = 4  # starts that are tried, each half as strong as the one before
 WIDENING = 5.0  # a place with a missing effect may have a linear stiffness far outside its tolerance
 
@@ -167,13 +168,14 @@ def paths_to_sensors(bench: Bench, fit: LinearFit, places: list[str], s: Complex
     return np.asarray(out if chain is None else np.moveaxis(chain.apply(np.moveaxis(out, 2, 0)), 0, 2))
 
 
-def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...]) -> Hypothesis:
+def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], beat: float = np.inf) -> Hypothesis:
     """Estimation of effects none of which is a force, together with the linear model.
 
     Parameters
     ----------
     start : linear fit to begin from.
     candidates : effects with starting values from the first search; none for the linear model alone.
+    beat : cost of a rival's linear fit; what starts from a fit that is no good and stays far above it is left there.
     """
     fam, evidence = bench.family, bench.evidence
     effects, kinds, ext, sd, x = _prepared(bench, start, candidates)
@@ -183,13 +185,19 @@ def estimate_linear(bench: Bench, start: LinearFit, candidates: tuple[Candidate,
     if ext is not None and (start.cost > POOR * start.dof or strained(fam, start.theta, sd)):
         begin.append(coarse(fam, np.zeros(fam.size), s, evidence.H, variance, ext, x)[:2])
 
-    def onward(at: tuple[Array, Array], steps: int) -> tuple[Array, Array, float]:
-        return descend(fam, at[0], s, evidence.H, variance, steps, prior_sd=sd, extension=ext, x=at[1], tol=0.03, spread=spread)
+    def onward(at: tuple[Array, Array], steps: int, every: int = 1) -> tuple[Array, Array, float]:
+        thin = slice(None, None, every)
+        return descend(fam, at[0], s[thin], evidence.H[thin], variance[thin], steps, prior_sd=sd, extension=ext, x=at[1], tol=0.03,
+                       spread=spread)
 
-    # from a fit that is sound the nearest start leads on; where it is not, each is followed some way
-    first = sorted((onward(at, 0 if start.status == "ok" else FOLLOWED) for at in begin), key=lambda e: e[2])
+    # from a fit that is sound the nearest start leads on; where it is not, each is followed some way on some of the lines
+    sound = start.status == "ok"
+    first = sorted((onward(at, 0 if sound else FOLLOWED, 1 if sound else THIN) for at in begin), key=lambda e: e[2])
+    if not sound and THIN * first[0][2] > HOPELESS * beat:
+        fit = finish(fam, first[0][0], s, evidence.H, variance, ext, first[0][1], sd, spread=spread, rounds=0)
+        return hypothesis(bench, effects, kinds, fit, evidence.chi2, np.zeros((0, 0)), evidence.residual, "ok")
     end = onward(first[0][:2], 30)
-    if start.status == "ok" and not end[2] < start.cost:
+    if sound and not end[2] < start.cost:
         end = min((end, *(onward(at[:2], 30) for at in first[1:])), key=lambda e: e[2])
     theta, x, _ = end
     fit = finish(fam, theta, s, evidence.H, variance, ext, x, sd, spread=spread)

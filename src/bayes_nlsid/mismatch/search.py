@@ -110,12 +110,19 @@ def _estimated(bench: Bench, fit: LinearFit, band: tuple[float, float], columns:
     From a linear fit that is no good every estimate is long and all but one are in vain: there the first few lead the way.
     """
     found: list[Hypothesis] = []
+
+    def tried(some: list[Candidate]) -> list[Hypothesis]:
+        out = found
+        for c in some:
+            out = _better(out, [estimate(bench, fit, (c,), out[0].fit.cost if out else np.inf)])
+        return out
+
     for _ in range(3):
         few = columns[:FIRST_FEW] if fit.status != "ok" else columns
-        found = _better(found, [estimate(bench, fit, (c,)) for c in few])
+        found = tried(few)
         again = min((estimate_linear(bench, h.fit, ()).fit for h in found[:2]), key=lambda f: f.cost, default=fit)
         if not again.cost < fit.cost - 3.0:
-            found = _better(found, [estimate(bench, fit, (c,)) for c in columns[len(few):]])
+            found = tried(columns[len(few):])
             break
         fit = again
         columns = _short_linear(scan_linear(bench.family, fit, bench.channels, bench.mass, bench.stiffness, band)) or columns
