@@ -22,7 +22,7 @@ from bayes_nlsid.mismatch.linear import Attachment, Family, fields, jacobian, re
 from bayes_nlsid.mismatch.motion import settle
 from bayes_nlsid.mismatch.paths import LawAlong, bed
 from bayes_nlsid.mismatch.poles import pair, vector_fit
-from bayes_nlsid.mismatch.probability import BY_HAND, Score, Scores, features, fit_layer, probabilities, task_of, unproposed
+from bayes_nlsid.mismatch.probability import BY_HAND, Score, Scores, features, fit_layer, probabilities, task_of, reserved
 from bayes_nlsid.mismatch.prove import calibrate_bands, elpd_difference, nrmse
 from bayes_nlsid.mismatch.shapes import shape_columns
 from bayes_nlsid.mismatch.spectra import Spectra
@@ -172,14 +172,14 @@ def test_modes_keep_their_signs_so_that_errors_of_their_shapes_keep_their_meanin
         assert (np.einsum("nm,nk,km->m", nominal, np.einsum("pij->ij", fam.M_parts) + fam.M_rest, moved) > 0).all()
 
 
-def test_what_the_search_did_not_propose_keeps_a_reserve() -> None:
+def test_what_the_features_speak_against_keeps_a_reserve() -> None:
     one = Scores((Score((("hardening", "J1"),), 300.0), Score((("clearance", "J1"), ("sensor_gain", "S2")), 320.0)))
     keys, table = features(one)
-    missed = unproposed(keys, np.array([0.2, 0.6, 0.1, 0.1]))
+    missed = reserved(keys, np.array([0.2, 0.6, 0.1, 0.1]))
     assert sum(missed.values()) == pytest.approx(1.0)
     assert (("hysteresis", "J1"),) in missed and (("sensor_gain", "-"),) in missed and (("force_gain", "FORCE"),) in missed
-    assert (("hardening", "J1"),) not in missed and (("hardening", "J1"), ("softening", "J1")) in missed
-    assert not any(key in missed for key in keys)
+    assert (("hardening", "J1"), ("softening", "J1")) in missed and () not in missed and (("other", "-"),) not in missed
+    assert missed[(("hardening", "J1"),)] == pytest.approx(1 / 6)     # a third for what was proposed
     assert sum(probabilities(one).values()) == pytest.approx(1.0)
     assert probabilities(one)[(("hysteresis", "J1"),)] > 0
 

@@ -35,6 +35,7 @@ FEATURES = (
     "gain of best", "visible of best",              # against nothing at all
     "unexplained", "held", "linear leftover",       # for something outside the catalogue
     "attachment", "input or channel", "incoherent", "pair with attachment", "pair with incoherent", "faint",
+    "pair of one class", "pair at one place",       # two laws that may be one whose formula is not the right one
     "second incoherent",                            # what a disturbance adds, in its own scale: no law makes it up
 )
 AT_LEAST_ZERO = {"lag", "steps behind", "relative lag", "gain of force", "gain of attachment", "gain of channel", "gain of incoherent",
@@ -58,7 +59,7 @@ class Layer:
         In the order of ``FEATURES``.
     provenance : str
     reserve : float
-        Probability kept for classes, and for second effects beside the leader, that the search did not propose.
+        Part of the probability that something is missing kept for what the features speak against, see ``reserved``.
 
     Raises
     ------
@@ -68,7 +69,7 @@ class Layer:
 
     weights: tuple[float, ...]
     provenance: str = "set by hand before any fit"
-    reserve: float = 0.03
+    reserve: float = 0.07
 
     def __post_init__(self) -> None:
         if len(self.weights) != len(FEATURES):
@@ -200,6 +201,8 @@ def _of_item(i: Score, best: float, scale: float, lowest: float) -> dict[str, fl
         row["second share"] = float(np.clip(np.log(added / max(best, 1e-3)), -8, 0))
         row["second of rest"] = float(np.clip(np.log((added + scale) / (max(i.rest, 0.0) + 10 * scale)), -4, 4)) + 4
         row["pair with attachment"] = float(bool(classes & _ATTACHMENTS))
+        row["pair of one class"] = float(len(classes) == 1)
+        row["pair at one place"] = float(len({place for _, place in i.key}) == 1)
     else:
         row["attachment"] = float(group == "attachment")
         row["input or channel"] = float(group == "channel")
@@ -236,28 +239,38 @@ def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float
         return {(): 1.0}
     layer = layer or SHIPPED
     p = _softmax(table @ np.array(layer.weights) + np.log([_prior(k) for k in keys]))
-    missed = unproposed(keys, p)
-    reserve = layer.reserve if missed else 0.0
-    found = {key: (1 - reserve) * float(x) for key, x in zip(keys, p, strict=True)} | {k: reserve * share for k, share in missed.items()}
+    kept = reserved(keys, p)
+    reserve = layer.reserve if kept else 0.0
+    found = {key: float(x) if not key else (1 - reserve) * float(x) for key, x in zip(keys, p, strict=True)}
+    something = 1 - found[()]
+    for key, share in kept.items():
+        found[key] = found.get(key, 0.0) + reserve * something * share
+    total = sum(found.values())
+    found = {key: x / total for key, x in found.items()}
     return dict(sorted(found.items(), key=lambda kv: -kv[1]))
 
 
-def unproposed(keys: Sequence[Key], p: Array) -> dict[Key, float]:
-    """Classes of the catalogue that are not among the hypotheses, alone and beside the leading effect: their shares of the reserve.
+def reserved(keys: Sequence[Key], p: Array) -> dict[Key, float]:
+    """Shares of the reserve: a third each for classes of the catalogue that are not among the hypotheses, alone; the same beside the leading
+    effect; and what was proposed, whatever the layer makes of it, the best place of each.
 
-    They stand where the leader stands if they can.
+    Classes that were not proposed stand where the leader stands if they can.
     """
-    real = [(key, x) for key, x in zip(keys, p, strict=True) if key and key != STRANGE]
+    real = sorted(((key, x) for key, x in zip(keys, p, strict=True) if key and key != STRANGE), key=lambda kx: -kx[1])
     if not real:
         return {}
-    leader = max(real, key=lambda kx: kx[1])[0]
+    leader = real[0][0]
     beside = max(leader, key=lambda e: sum(x for key, x in real if e in key))
     alone = {key[0][0] for key, _ in real if len(key) == 1}
     second = {cls for key, _ in real if len(key) == 2 and beside in key for cls, _ in key if cls != beside[0]}
     rows = [r for r in ROWS.values() if r.name not in ("none", "other")]
     single: list[Key] = [((r.name, _stand(r.sits, beside)),) for r in rows if r.name not in alone]
     pairs: list[Key] = [tuple(sorted((beside, (r.name, _stand(r.sits, beside))))) for r in rows if r.name not in second | {beside[0]}]
-    return {key: 0.5 / len(group) if single and pairs else 1 / len(group) for group in (single, pairs) for key in group}
+    best: dict[tuple[str, ...], Key] = {}
+    for key, _ in real:
+        best.setdefault(tuple(sorted(cls for cls, _ in key)), key)
+    groups = [group for group in (single, pairs, list(best.values())) if group]
+    return {key: 1 / (len(groups) * len(group)) for group in groups for key in group}
 
 
 def _stand(sits: str, leader: tuple[str, str]) -> str:
@@ -321,13 +334,14 @@ class Task:
     def loss(self, w: Array, reserve: float) -> tuple[float, Array]:
         """−log p of the true classes and, at half the weight, of the place given the classes; with the gradient in the weights."""
         p = _softmax(self.table @ w + self.prior)
-        mean = p @ self.table
+        mean, none = p @ self.table, -2   # place of "nothing is missing" among the hypotheses
         named = float(p[self.named].sum())
-        whole = (1 - reserve) * named + reserve * self.share + 1e-6
-        value, slope = -float(np.log(whole)), np.zeros_like(w)
+        part, rest = (1.0, 0.0) if self.named[none] else (1 - reserve, reserve * self.share)
+        whole = part * named + rest * (1 - p[none]) + 1e-6
+        value, slope = -float(np.log(whole)), rest * p[none] * (self.table[none] - mean) / whole
         if named > 0:
             inside = p[self.named] @ self.table[self.named] / named
-            slope = -(1 - reserve) * named / whole * (inside - mean)
+            slope = slope - part * named / whole * (inside - mean)
             if self.exact >= 0:
                 value -= PLACED * float(np.log(max(p[self.exact], 1e-300) / named))
                 slope = slope - PLACED * (self.table[self.exact] - inside)
@@ -341,8 +355,8 @@ def task_of(scores: Scores, truth: Key) -> Task:
     wanted = tuple(sorted(truth))
     classes = tuple(sorted(cls for cls, _ in wanted))
     named = np.array([tuple(sorted(cls for cls, _ in key)) == classes for key in keys])
-    missed = unproposed(keys, np.exp(prior))
-    share = sum(x for key, x in missed.items() if tuple(sorted(cls for cls, _ in key)) == classes)
+    kept = reserved(keys, np.exp(prior))
+    share = sum(x for key, x in kept.items() if tuple(sorted(cls for cls, _ in key)) == classes)
     return Task(table, prior, named, keys.index(wanted) if wanted in keys else -1, float(share))
 
 
@@ -363,5 +377,5 @@ FITTED = _layer("fitted on 56 cases of studies/concealed (seed 9201; normal prio
                 visible=0.432, visible_second=0.865, strength=1.345, regret=1.124, small_regret=0.368, second=0.262, second_share=0.000,
                 second_of_rest=0.5, gain_of_best=-0.428, visible_of_best=-0.302, unexplained=0.508, held=0.816, linear_leftover=0.162,
                 attachment=-0.144, input_or_channel=0.152, incoherent=0.095, pair_with_attachment=-1.544, pair_with_incoherent=0.198,
-                faint=-2.126, second_incoherent=0.8)
+                faint=-2.126, second_incoherent=0.8, pair_of_one_class=-1.0, pair_at_one_place=-1.0)
 SHIPPED = FITTED
