@@ -19,11 +19,11 @@ from bayes_nlsid.mismatch.form import groups_price, likeliest_groups, likeliest_
 from bayes_nlsid.mismatch.linear import Attachment, Family, Fields, fields, jacobian, solve
 from bayes_nlsid.mismatch.poles import modal_start
 from bayes_nlsid.mismatch.shapes import shape_columns, with_shape_errors
+from bayes_nlsid.mismatch.valley import Place, follow
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RELATIVE_FLOOR = 2e-4  # of any model of this kind
-LONGEST = 1.5  # step of any parameter
 NEAR = 20.0  # cost per value from which full steps may lead on
 
 
@@ -229,57 +229,6 @@ def assemble(fam: Family, theta: Array, x: Array, s: Complex, measured: Complex,
     return System(normal, gradient, chi2, root, Br, Jr, C, r)
 
 
-@final
-@dataclass(frozen=True)
-class Place:
-    """Parameters ``y`` (P,) with the normal matrix (P, P) of the cost there, the gradient (P,) of −cost/2, and the cost."""
-
-    y: Array
-    normal: Array
-    gradient: Array
-    cost: float
-
-    @property
-    def step(self) -> Array:
-        """(P,) of Gauss and Newton."""
-        return np.asarray(np.linalg.solve(self.normal, self.gradient))
-
-    @property
-    def promise(self) -> float:
-        """Decrease of the cost that a full step promises."""
-        return float(self.gradient @ self.step)
-
-
-def _ahead(at: Callable[[Array], Place], here: Place, turns: int = 4) -> Place | None:
-    """Where full steps lead within some ``turns``, the cost above what it was in between; None if they do not lead below it.
-
-    Sharp resonances make the valleys of the cost narrow and bent: a step along a valley leaves it by its own square, which the next
-    step mends. Steps so short that every one of them stays inside would need hundreds (cf. the watchdog of Chamberlain et al. 1982).
-    """
-    there = here
-    for _ in range(turns):
-        step = there.step
-        if not np.abs(step).max(initial=0.0) < LONGEST:
-            return None
-        there = at(there.y + step)
-        if there.cost < here.cost:
-            return there
-        if not there.promise > 0.5 * (there.cost - here.cost):
-            return None
-    return None
-
-
-def _damped(at: Callable[..., Place], here: Place, damping: float) -> tuple[Place | None, float]:
-    """The first damped step that lowers the cost (None if there is no such step), and the damping for the next."""
-    for _ in range(6):
-        step = np.linalg.solve(here.normal + damping * np.diag(np.diag(here.normal)), here.gradient)
-        trial = here.y + np.clip(step, -LONGEST, LONGEST)
-        if np.isfinite(trial).all() and at(trial, False).cost < here.cost:
-            return at(trial), max(damping / 6, 1e-9)
-        damping = max(damping * 8, 1e-4)
-    return None, damping
-
-
 def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, steps: int, *, prior_sd: Array | None = None,
             extension: Extension | None = None, x: Array | None = None, log: bool = False, tol: float = 1e-3, spread: Array | None = None
             ) -> tuple[Array, Array, float]:
@@ -299,19 +248,8 @@ def descend(fam: Family, theta: Array, s: Complex, measured: Complex, variance: 
             normal, gradient = normal + np.diag(prior), gradient - prior * (y - centre)
         return Place(y, normal, gradient, system.chi2 + float(prior @ (y - centre) ** 2))
 
-    here, damping = at(np.concatenate([theta, x])), 1e-3
-    for _ in range(steps):
-        # along a valley each damped step gains little: what is left to gain decides, not what the last step gained
-        if here.promise < tol * max(1.0, 1e-3 * here.cost):
-            break
-        ahead = _ahead(at, here) if here.cost < NEAR * 2 * measured.size else None
-        if ahead is None:
-            ahead, damping = _damped(at, here, damping)
-        if ahead is None:
-            break
-        here = ahead
-    y, cost = here.y, here.cost
-    return y[:count], y[count:], cost
+    end = follow(at, np.concatenate([theta, x]), steps, tol, NEAR * 2 * measured.size)
+    return end.y[:count], end.y[count:], end.cost
 
 
 def finish(fam: Family, theta: Array, s: Complex, measured: Complex, variance: Array, extension: Extension | None = None,

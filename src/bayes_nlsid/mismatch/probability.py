@@ -251,8 +251,8 @@ def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float
 
 
 def reserved(keys: Sequence[Key], p: Array) -> dict[Key, float]:
-    """Shares of the reserve: a third each for classes of the catalogue that are not among the hypotheses, alone; the same beside the leading
-    effect; and what was proposed, whatever the layer makes of it, the best place of each.
+    """Shares of the reserve: a third each for classes of the catalogue that are not among the hypotheses, alone; the same beside the
+    leading effect; and what was proposed, whatever the layer makes of it, the best place of each.
 
     Classes that were not proposed stand where the leader stands if they can.
     """
