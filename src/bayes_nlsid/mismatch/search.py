@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.effects import Effect, pack
+from bayes_nlsid.mismatch.effects import Effect, pack, weakened
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
-from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, estimate_linear, everywhere
+from bayes_nlsid.mismatch.polish import WEAKER, Bench, Hypothesis, begin, estimate_linear, everywhere
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -361,7 +361,15 @@ def _paired(bench: Bench, start: LinearFit, pair: tuple[Candidate, ...]) -> Hypo
     if len(linear) == 1 and not len(start.x):
         left = replace(bench, evidence=replace(bench.evidence, H=start.measured, variance=start.variance))
         start = estimate_linear(left, start, linear).fit
-    return refine(bench, begin(bench, start, pair, steps=1, weaker=0), steps=4, quick=True)
+    begun = begin(bench, start, pair, steps=1, weaker=0)
+    for _ in range(WEAKER if not linear else 0):
+        # the second law was seen on a motion that it changes itself
+        pair = (*pair[:-1], replace(pair[-1], effect=weakened(pair[-1].effect, 0.5)))
+        less = begin(bench, start, pair, steps=1, weaker=0)
+        if not less.misfit_records < begun.misfit_records:
+            break
+        begun = less
+    return refine(bench, begun, steps=4, quick=True)
 
 
 def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis], gained: float) -> list[Hypothesis]:
