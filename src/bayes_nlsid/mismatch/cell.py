@@ -110,7 +110,7 @@ def straightened(case: Case, spectra: Spectra) -> Case | None:
         return None
 
     def straight(record: CaseRecord) -> CaseRecord:
-        x = record.force / scale
+        x = np.clip(record.force / scale, -1.0, 1.0)    # beyond the forces that showed it a curve goes on as it ended
         return replace(record, force=record.force - sum(ck * x ** k for ck, k in zip(c, POWERS, strict=True)))
 
     return replace(case, records=tuple(straight(r) for r in case.records))

@@ -17,12 +17,14 @@ from bayes_nlsid.study.sketch import Sketch
 
 Array = NDArray[np.float64]
 SHOWN = 10
+FEWEST = 3     # that are shown however unlikely
 FINER = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def hypotheses(names: Sequence[str], probability: Array) -> Figure:
     """Probability of every explanation, likeliest first."""
     order = np.argsort(-probability, kind="stable")[:SHOWN]
+    order = order[:max(FEWEST, int((probability[order] > 0.005).sum()))]
     figure, grid = canvas(1, 1, height=0.8 + 0.27 * max(len(order), 3))
     axes = grid[0][0]
     at = np.arange(len(order))
@@ -34,7 +36,7 @@ def hypotheses(names: Sequence[str], probability: Array) -> Figure:
     axes.grid(False, axis="y")
     rest = float(probability.sum() - probability[order].sum())
     if rest > 0.005:
-        axes.set_title(f"the ten likeliest; all others together {whole_percent(rest)}")
+        axes.set_title(f"the {len(order)} likeliest; all others together {whole_percent(rest)}")
     return figure
 
 
