@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayes_nlsid.mismatch.probability import FEATURES, SHIPPED, Key, Layer, Scores, fit_layer, probabilities, scores_from
+from bayes_nlsid.mismatch.probability import FEATURES, SHIPPED, Key, Layer, Scores, classes_of, fit_layer, probabilities, scores_from
 
 FLOOR = 1e-4  # a probability below this counts as this
 
@@ -25,16 +25,11 @@ def gather(results: Path, answers: Path) -> tuple[list[Scores], list[Key]]:
     return scores, truths
 
 
-def classes(key: Key) -> tuple[str, ...]:
-    """Sorted classes of a key."""
-    return tuple(sorted(cls for cls, _ in key))
-
-
 def log_loss(layer: Layer, scores: list[Scores], truths: list[Key]) -> float:
     """Mean of −log p of the true classes, at whatever place."""
     total = 0.0
     for one, truth in zip(scores, truths, strict=True):
-        p = sum(x for key, x in probabilities(one, layer).items() if classes(key) == classes(truth))
+        p = sum(x for key, x in probabilities(one, layer).items() if classes_of(key) == classes_of(truth))
         total -= float(np.log(max(p, FLOOR)))
     return total / max(len(scores), 1)
 

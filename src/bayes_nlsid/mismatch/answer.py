@@ -15,7 +15,7 @@ from bayes_nlsid.mismatch.diagnose import Analysis, Progress, Proof, Rival, clai
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, Named
 from bayes_nlsid.mismatch.portrait import portrait
 from bayes_nlsid.mismatch.probability import STRANGE as OTHER
-from bayes_nlsid.mismatch.probability import Key, Layer
+from bayes_nlsid.mismatch.probability import Key, Layer, classes_of
 from bayes_nlsid.mismatch.prove import Predictor, envelope
 from bayes_nlsid.mismatch.words import PHASES, error_percent, power_onset, separates, size_of, sure, whole_percent
 
@@ -70,7 +70,7 @@ def _named(analysis: Analysis, odds: dict[Key, float], seed: int) -> tuple[Named
     out: dict[tuple[str, ...], list[Named]] = {}
     for i, (key, p) in enumerate(ordered):
         effects = key if key else (("none", "-"),)
-        alike = out.setdefault(tuple(sorted(c for c, _ in effects)), [])
+        alike = out.setdefault(classes_of(effects), [])
         if alike and i >= LISTED and key and key != OTHER:
             alike[0] = replace(alike[0], probability=alike[0].probability + p)
             continue

@@ -295,10 +295,9 @@ def prove(analysis: Analysis, rival: Rival | None) -> tuple[Proof, Predictor]:
     chosen, name = (updated, "updated") if withdrawn else (extended, "extended")
     bands = calibrate_bands(analysis.noise, measured, waves[name], case.rate)
     first = calibrate_bands(analysis.noise, measured, waves["updated"], case.rate)
-    alike = all(np.array_equal(a, b) for a, b in zip(waves[name], waves["updated"], strict=True))
-    elpd, se = (0.0, 0.0) if alike else elpd_difference(np.concatenate(measured), np.concatenate(waves["updated"]),
-                                                                    np.concatenate(waves[name]), first, bands, case.rate)
     y, p = np.concatenate(measured), np.concatenate(waves[name])
+    alike = all(np.array_equal(a, b) for a, b in zip(waves[name], waves["updated"], strict=True))
+    elpd, se = (0.0, 0.0) if alike else elpd_difference(y, np.concatenate(waves["updated"]), p, first, bands, case.rate)
     coverage = float((np.abs(y - p) < bands.factor * bands.sd(p, case.rate)).mean())
     floor = float(np.sqrt((analysis.noise ** 2).mean() / np.mean([(m ** 2).mean() for m in measured])))
     stored = {"measured": measured[0], "nominal": waves["nominal"][0], "updated": waves["updated"][0], "extended": waves[name][0]}

@@ -70,6 +70,12 @@ class Joint:
         self.variance = floored(evidence.H, evidence.doubted(h.residual) if doubt else evidence.variance)
         self.sd = widened(bench.family, h.fit.sd, {e.place for e in h.effects if e.is_force or e.cls == "linear_stiffness"})
 
+    @property
+    def linear_prior(self) -> tuple[Array, Array]:
+        """Precision and centre (P + X,) of the prior of the linear parameters (theta, x)."""
+        beside = (np.zeros(0), np.zeros(0)) if self.ext is None else (1 / self.ext.prior_sd ** 2, self.ext.centre)
+        return np.concatenate([1 / self.sd ** 2, beside[0]]), np.concatenate([np.zeros(len(self.sd)), beside[1]])
+
     def effects(self, y: Array) -> tuple[Effect, ...]:
         """The force effects at ``y``."""
         return tuple(unpack(e, y[a:b], e) for e, a, b in zip(self.forces, self.edges[:-1], self.edges[1:], strict=True))
@@ -210,15 +216,12 @@ def _step(joint: Joint, now: Point, at: tuple[Array, Array, Array], errors: Arra
 def _mended(joint: Joint, at: tuple[Array, Array, Array], there: Point, value: float, errors: Array, cost: float, coarse: bool
             ) -> tuple[tuple[Array, Array, Array], Point, float]:
     """A step that left the narrow valley of a sharp resonance, led back to it by the linear parameters alone if these promise to do so."""
-    y, theta, x = at
-    ext, prior = joint.ext, 1 / joint.sd ** 2
-    centre = np.zeros(len(theta))
-    if ext is not None:
-        prior, centre = np.concatenate([prior, 1 / ext.prior_sd ** 2]), np.concatenate([centre, ext.centre])
+    (y, theta, x), (prior, centre) = at, joint.linear_prior
     for _ in range(2):
         if not np.isfinite(value):
             break
-        system = assemble(joint.bench.family, theta, x, joint.s, there.cleaned, joint.variance, ext, spread=joint.h.fit.spread)
+        system = assemble(joint.bench.family, theta, x, joint.s, there.cleaned, joint.variance, joint.ext,
+                          spread=joint.h.fit.spread)
         gradient = system.gradient - prior * (np.concatenate([theta, x]) - centre)
         step = np.linalg.solve(system.normal + np.diag(prior), gradient)
         if not float(gradient @ step) > 0.5 * (value - cost) or np.abs(step).max() > 1.0:
@@ -259,8 +262,7 @@ def _linearise(joint: Joint, now: Point, y: Array, theta: Array, x: Array, error
     normal, gradient = _columns(system, change, laws)
     normal[np.ix_(active, active)] += (columns.conj() @ columns.T).real
     gradient[active] += (columns.conj() @ now.residual.ravel()).real
-    prior = np.concatenate([np.full(laws, 1e-2), 1 / joint.sd ** 2, np.zeros(0) if joint.ext is None else 1 / joint.ext.prior_sd ** 2])
-    centre = np.concatenate([y, np.zeros(len(theta)), np.zeros(0) if joint.ext is None else joint.ext.centre])
+    prior, centre = (np.concatenate([law, linear]) for law, linear in zip((np.full(laws, 1e-2), y), joint.linear_prior, strict=True))
     normal += np.diag(prior)
     gradient -= prior * (np.concatenate([y, theta, x]) - centre)
     curvature = normal[:laws, :laws] - normal[:laws, laws:] @ np.linalg.solve(normal[laws:, laws:], normal[laws:, :laws])

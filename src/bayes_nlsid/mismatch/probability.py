@@ -149,6 +149,11 @@ def scores_from(stored: Mapping[str, Any]) -> Scores:
     return Scores(items, *(number(stored[k]) for k in ("unexplained", "dispersion", "linear", "held")))
 
 
+def classes_of(key: Key) -> tuple[str, ...]:
+    """Sorted classes of a hypothesis, whatever its places; empty for ``none``."""
+    return tuple(sorted(cls for cls, _ in key))
+
+
 def sigmoid(x: float) -> float:
     """1/(1 + exp(−x)), safe for any x."""
     return float(1 / (1 + np.exp(-np.clip(x, -700, 700))))
@@ -245,8 +250,6 @@ def probabilities(scores: Scores, layer: Layer | None = None) -> dict[Key, float
     something = 1 - found[()]
     for key, share in kept.items():
         found[key] = found.get(key, 0.0) + reserve * something * share
-    total = sum(found.values())
-    found = {key: x / total for key, x in found.items()}
     return dict(sorted(found.items(), key=lambda kv: -kv[1]))
 
 
@@ -268,7 +271,7 @@ def reserved(keys: Sequence[Key], p: Array) -> dict[Key, float]:
     pairs: list[Key] = [tuple(sorted((beside, (r.name, _stand(r.sits, beside))))) for r in rows if r.name not in second | {beside[0]}]
     best: dict[tuple[str, ...], Key] = {}
     for key, _ in real:
-        best.setdefault(tuple(sorted(cls for cls, _ in key)), key)
+        best.setdefault(classes_of(key), key)
     groups = [group for group in (single, pairs, list(best.values())) if group]
     return {key: 1 / (len(groups) * len(group)) for group in groups for key in group}
 
@@ -353,10 +356,8 @@ def task_of(scores: Scores, truth: Key) -> Task:
     keys, table = features(scores)
     prior = np.log([_prior(k) for k in keys])
     wanted = tuple(sorted(truth))
-    classes = tuple(sorted(cls for cls, _ in wanted))
-    named = np.array([tuple(sorted(cls for cls, _ in key)) == classes for key in keys])
-    kept = reserved(keys, np.exp(prior))
-    share = sum(x for key, x in kept.items() if tuple(sorted(cls for cls, _ in key)) == classes)
+    named = np.array([classes_of(key) == classes_of(wanted) for key in keys])
+    share = sum(x for key, x in reserved(keys, np.exp(prior)).items() if classes_of(key) == classes_of(wanted))
     return Task(table, prior, named, keys.index(wanted) if wanted in keys else -1, float(share))
 
 
