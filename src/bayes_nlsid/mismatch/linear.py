@@ -245,10 +245,10 @@ def _corrected(fam: Family, fld: Fields, s: Complex) -> Fields:
     return replace(fld, H=fld.H - (s ** 3)[:, None] * (fld.left @ (fld.right @ between)[:, :, None])[:, :, 0])
 
 
-def dashpot_columns(fam: Family, fld: Fields, s: Complex, at: NDArray[np.intp]) -> Complex:
-    """(len(at), L, S): change of the accelerance per N s/m of dashpots, what it does to each mode's own damping apart (that has its own
+def dashpot_columns(fam: Family, fld: Fields, s: Complex) -> Complex:
+    """(D, L, S): change of the accelerance per N s/m of dashpots, what it does to each mode's own damping apart (that has its own
     deviation already)."""
-    rows = fam.dashpots[at] @ fld.modes.basis[:, :fld.right.shape[1]]
+    rows = fam.dashpots @ fld.modes.basis[:, :fld.right.shape[1]]
     through = (fld.right @ rows.T)[:, None, :] * (fld.left @ rows.T)                                     # (L, S, D)
     own = fld.left @ (fld.right[:, :, None] * (rows ** 2).T)
     return np.moveaxis(-(s ** 3)[:, None, None] * (through - own), 2, 0)
@@ -316,7 +316,7 @@ def jacobian(fam: Family, theta: Array, fld: Fields, s: Complex) -> Complex:
     out[fam.moving:fam.moving + fam.modes] = np.moveaxis(s2[:, None] * pushed, 2, 0)
     if len(fam.dashpots):
         joined = fam.moving + fam.modes + np.arange(len(fam.dashpots))
-        out[joined] = fam.dashpot[:, None, None] * dashpot_columns(fam, fld, s, np.arange(len(fam.dashpots)))
+        out[joined] = fam.dashpot[:, None, None] * dashpot_columns(fam, fld, s)
     out[fam.size - len(fam.pairs[0]):] = _mixing_columns(fam, fld, s, near, turned[0])
     return out
 
