@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.identification.fit import Fit
 from bayes_nlsid.inference.likelihood import Likelihood, laplace
+from bayes_nlsid.inference.prior import sample_priors
 from bayes_nlsid.inference.target import Target
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ def first_walkers(target: Target, middle: Array, count: int, seeds: list[np.rand
             which = rng.integers(len(middle), size=count)
             s = _scatter(target, middle[which], np.array(roots)[which], rng)
         else:
-            s = target.to_s(np.stack([p.sample(count, rng) for p in target.priors], axis=-1))
+            s = target.to_s(sample_priors(target.priors, count, rng))
         value = target(s)
         if not np.isfinite(value).any():
             raise InputError("sampling", "no point near the fit has a finite posterior density", "check bounds, priors and force laws")
