@@ -1,4 +1,4 @@
-"""Values that scatter around a common one: against direct integration over the common value and the scatter, in closed form where it exists."""
+"""Values that scatter around a common one: against direct integration over the common value and the scatter, and closed forms."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ def test_density_is_the_integral_over_common_value_and_scatter(z, mean, sd):
         width = 10 * np.exp(log_tau) / np.sqrt(3)
         return max(low, values.mean() - width), min(high, values.mean() + width)
 
-    direct = dblquad(integrand, np.log(0.5 * LEAST), np.log(0.5 * MOST), lambda t: span(t)[0], lambda t: span(t)[1], epsabs=0, epsrel=1e-7)[0]
+    direct = dblquad(integrand, np.log(0.5 * LEAST), np.log(0.5 * MOST), lambda t: span(t)[0], lambda t: span(t)[1],
+                     epsabs=0, epsrel=1e-7)[0]
     assert np.exp(found.log_density(values) + found.log_inside) == pytest.approx(direct, rel=2e-3)
 
 

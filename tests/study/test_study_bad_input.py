@@ -76,6 +76,13 @@ CASES = {
     "odd walkers": ("ensembles = 4", "ensembles = 4\nwalkers = 9", ["walkers", "9 is not an even number"]),
     "prior of nothing": ("[prediction]", '[[posterior.priors]]\nparameter = "cubic[*].k"\nkind = "normal"\nmean = 1\nsd = 1\n[prediction]',
                          ["[[posterior.priors]] 1 parameter", "'cubic[*].k' is none", "did you mean 'cubic[*].c'"]),
+    "group of nothing": ("[prediction]", '[[posterior.groups]]\nparameters = ["cubic[*].k"]\n[prediction]',
+                         ["[[posterior.groups]] 1 parameters", "'cubic[*].k' is none", "did you mean 'cubic[*].c'"]),
+    "group without members": ("[prediction]", "[[posterior.groups]]\nparameters = []\n[prediction]", ["parameters", "is empty"]),
+    "two groups of one": ("[prediction]", '[[posterior.groups]]\nparameters = ["cubic[*].c"]\n[[posterior.groups]]\n'
+                                          'parameters = ["cubic[x].c"]\n[prediction]', ["[[posterior.groups]] 2", "in group 1 already"]),
+    "group without scatter": ("[prediction]", '[[posterior.groups]]\nparameters = ["cubic[*].c"]\nscatter = 0\n[prediction]',
+                              ["[[posterior.groups]] 1 scatter", "0"]),
     "no structure": ("[structure] ", "[structures] ", ["[structure]", "is missing"]),
     "not TOML": ("seed = 1", "seed = = 1", ["is not valid TOML", "line 5"]),
     "own term unusable": ("[posterior]", '[[terms]]\nname = "mine"\nformula = "c*import"\nparams = { c = ["N", "coefficient"] '

@@ -109,7 +109,7 @@ class Pool:
     def log_density(self, z: ArrayLike) -> Array:
         """Natural logarithm of the density (...) of z (..., J); −inf outside the bounds."""
         values = np.asarray(z, dtype=float)
-        inside = ((values >= self.box[:, 0]) & (values <= self.box[:, 1])).all(axis=-1)
+        inside = np.asarray(((values >= self.box[:, 0]) & (values <= self.box[:, 1])).all(axis=-1))
         safe = np.where(inside[..., None], values, 0.0)
         return np.asarray(np.where(inside, logsumexp(self.by_node(safe), axis=-1) - self.log_inside, -np.inf))
 
@@ -126,7 +126,8 @@ class Pool:
         while len(kept) < count:
             mu, tau = self.middles(rng.uniform(size=count)), rng.choice(self.tau, count, p=np.exp(self.log_weight))
             z = mu[:, None] + tau[:, None] * rng.normal(size=(count, len(self.box)))
-            kept = np.concatenate([kept, z[((z >= self.box[:, 0]) & (z <= self.box[:, 1])).all(axis=1)]])
+            inside = np.all((z >= self.box[:, 0]) & (z <= self.box[:, 1]), axis=1)
+            kept = np.concatenate([kept, z[inside]])
         return kept[:count]
 
     def common(self, z: Array, rng: np.random.Generator) -> tuple[Array, Array]:

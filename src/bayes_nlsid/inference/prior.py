@@ -7,7 +7,7 @@ depend on c. Parameters of nominally equal joints may share a common value that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal, final

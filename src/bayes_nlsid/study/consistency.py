@@ -156,6 +156,20 @@ def _check_priors(study: Study, where: str) -> None:
                              f"{prior.parameter!r} is none of the parameters that this study can have", nearest(prior.parameter, anywhere))
 
 
+    taken: dict[str, int] = {}
+    for i, group in enumerate(study.posterior.groups, start=1):
+        for pattern in group.parameters:
+            matched = [name for name in possible if same_parameter(pattern, name)]
+            if not matched:
+                anywhere = list(dict.fromkeys(re.sub(r"\[.*[^0-9].*\]", "[*]", name) for name in possible))
+                raise InputError(f"{where}: [[posterior.groups]] {i} parameters",
+                                 f"{pattern!r} is none of the parameters that this study can have", nearest(pattern, anywhere))
+            for name in matched:
+                if taken.setdefault(name, i) != i:
+                    raise InputError(f"{where}: [[posterior.groups]] {i} parameters", f"{name} is in group {taken[name]} already",
+                                     "name each parameter in one group")
+
+
 def same_parameter(pattern: str, name: str) -> bool:
     """Whether a name of a study, in which ``*`` stands for any part, means a parameter."""
     return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))

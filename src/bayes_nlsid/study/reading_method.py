@@ -17,6 +17,7 @@ from bayes_nlsid.study.quantities import quantity
 from bayes_nlsid.study.schema import (
     AlternativeEntry,
     ElementEntry,
+    GroupEntry,
     IdentificationEntry,
     PosteriorEntry,
     PredictionEntry,
@@ -208,7 +209,8 @@ def read_posterior(table: Table | None) -> PosteriorEntry | None:
     entry = PosteriorEntry(table.text("likelihood", "whittle", ("whittle", "plain")), table.integer("ensembles", 4, low=2),
                            table.integer("steps", None, low=10), table.integer("most", None, low=200),
                            table.integer("walkers", None, low=4), priors,
-                           table.text("stage", None, ("regression", "forward", "both")))
+                           table.text("stage", None, ("regression", "forward", "both")),
+                           tuple(_read_group(t) for t in table.tables("groups")))
     table.close()
     return entry
 
@@ -226,6 +228,15 @@ def _read_prior(table: Table) -> PriorEntry:
     if lower is not None and upper is not None and not lower < upper:
         raise table.wrong("upper", f"{upper:g} is not above lower {lower:g}", "write lower < upper")
     entry = PriorEntry(table.text("parameter"), kind, a, b, lower, upper)
+    table.close()
+    return entry
+
+
+def _read_group(table: Table) -> GroupEntry:
+    names = table.texts("parameters")
+    if not names or len(set(names)) != len(names):
+        raise table.wrong("parameters", f"{list(names)} is empty or repeats itself", 'write for example parameters = ["iwan4[*].k_t"]')
+    entry = GroupEntry(names, table.number("scatter", default=None, positive=True))
     table.close()
     return entry
 

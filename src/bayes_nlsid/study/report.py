@@ -174,9 +174,22 @@ def _posterior(report: Report) -> str:
              ["walkers re-drawn in burn-in, or stuck after it", str(c["stuck_walkers"])]]
     out += html.table(["sampler", ""], facts, "stages/posterior")
     out += stages_section(saved.data, parameters)
+    out += _common_values(saved.data.get("groups", []))
     priors = [[brief(p["parameter"]), brief(p["text"])] for p in saved.data.get("priors", [])]
     table = html.table(["parameter", "prior"], priors, "stages/posterior")
     return out + html.details("What was assumed beforehand (priors)", table)
+
+
+def _common_values(groups: Sequence[Mapping[str, Any]]) -> str:
+    """Nominally equal joints: their common value and how much they scatter around it."""
+    rows = []
+    for g in groups:
+        absolute = g["scatter_of"] == "parameter"
+        shown = [engineering(g["common"][q], g["unit"], 4) for q in ("q05", "q50", "q95")]
+        rows.append([brief(g["group"]), *shown, *(engineering(g["scatter"][q], g["unit"], 3) if absolute else f"{g['scatter'][q]:.2g}"
+                                                 for q in ("q05", "q50", "q95")), "the value" if absolute else f"its {g['scatter_of']}"])
+    head = ["nominally equal", "common, 5 %", "50 %", "95 %", "scatter, 5 %", "50 %", "95 %", "scatter of"]
+    return html.table(head, rows, "stages/posterior", numeric=(1, 2, 3, 4, 5, 6)) if rows else ""
 
 
 def _why_not(parameter: Mapping[str, Any]) -> str:

@@ -161,6 +161,20 @@ class PriorEntry:
 
 @final
 @dataclass(frozen=True)
+class GroupEntry:
+    """``[[posterior.groups]]``: one parameter of nominally equal joints, whose values scatter around a common one that is not known.
+
+    ``parameters`` are names or patterns with ``*``. ``scatter`` is the scale of the half-normal prior of the standard deviation between the
+    joints: of the natural logarithm for log-normal and log-uniform priors, of the logit for logit-normal ones, else in the unit of the
+    parameter; None takes 0.3, or 0.3 standard deviations of the prior of the common value.
+    """
+
+    parameters: tuple[str, ...]
+    scatter: float | None = None
+
+
+@final
+@dataclass(frozen=True)
 class PosteriorEntry:
     """``[posterior]``: ``steps`` after burn-in, or None to go on until converged; ``most`` limits them, burn-in included.
 
@@ -175,6 +189,7 @@ class PosteriorEntry:
     walkers: int | None = None
     priors: tuple[PriorEntry, ...] = ()
     stage: Literal["regression", "forward", "both"] | None = None
+    groups: tuple[GroupEntry, ...] = ()
 
 
 @final

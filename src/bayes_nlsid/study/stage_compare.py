@@ -19,9 +19,9 @@ from bayes_nlsid.prediction.comparison import Alternative, Comparison
 from bayes_nlsid.prediction.comparison import compare as score
 from bayes_nlsid.study.building import element_from
 from bayes_nlsid.study.context import Arrays, Context, Result
+from bayes_nlsid.study.priors import chosen_priors
 from bayes_nlsid.study.schema import CompareEntry
 from bayes_nlsid.study.stage_identify import band_of, base_problem, entry_of, stored_model
-from bayes_nlsid.study.stage_posterior import chosen_priors
 
 MOST_STEPS = 3000
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ from bayes_nlsid.inference.ensemble import MOST_STEPS, sample
 from bayes_nlsid.inference.forward import ForwardLikelihood, forward_likelihood
 from bayes_nlsid.inference.likelihood import Likelihood, PlainLikelihood, WhittleLikelihood
 from bayes_nlsid.inference.posterior import Posterior
-from bayes_nlsid.inference.prior import Prior, default_priors
+from bayes_nlsid.inference.prior import Prior, sample_priors
 from bayes_nlsid.inference.reweighting import forward_posterior
-from bayes_nlsid.study.consistency import same_parameter
 from bayes_nlsid.study.context import Context, Result
+from bayes_nlsid.study.priors import chosen_priors, common_values, described
 from bayes_nlsid.study.schema import PosteriorEntry
 from bayes_nlsid.study.stage_identify import stored_fit
 
@@ -72,11 +71,10 @@ def posterior(context: Context) -> Result:
         raise InputError(f"{context.study.file.name}: [posterior] most", f"the sampler left no draws ({'; '.join(found.reasons)})",
                          "raise most, or leave it out")
     rng = np.random.default_rng(context.random("prior"))
-    arrays["prior_draws"] = np.stack([p.sample(PRIOR_DRAWS, rng) for p in priors], axis=1)
+    arrays["prior_draws"] = sample_priors(priors, PRIOR_DRAWS, rng)
     _keep_whole(context, found, likelihood, arrays)
     data |= {"stage": stage, "stage_why": why,
-             "priors": [{"parameter": p.name, "text": p.sentence.removeprefix(f"{p.name}: "), "kind": p.kind, "a": p.a, "b": p.b,
-                         "lower": p.lower, "upper": p.upper} for p in priors]}
+             "priors": described(priors), "groups": common_values(priors, found.flat, rng)}
     return arrays, data
 
 
@@ -160,30 +158,6 @@ def _empty() -> dict[str, Any]:
 
 def _likelihood(entry: PosteriorEntry, start: Fit) -> Likelihood:
     return WhittleLikelihood(start) if entry.likelihood == "whittle" else PlainLikelihood(start)
-
-
-def chosen_priors(context: Context, start: Fit) -> tuple[Prior, ...]:
-    """The default priors with those of the study in their place; one for a term that was not chosen waits for another day.
-
-    Raises
-    ------
-    InputError
-        If a prior does not fit its bounds.
-    """
-    out = list(default_priors(start.problem))
-    for i, stated in enumerate(context.study.posterior.priors if context.study.posterior is not None else ()):
-        where = f"{context.study.file.name}: [[posterior.priors]] {i + 1}"
-        matched = [k for k, p in enumerate(out) if same_parameter(stated.parameter, p.name)]
-        if not matched:
-            context.note(f"the prior of {stated.parameter} is not used: the terms that were chosen have no such parameter")
-        for k in matched:
-            lower = out[k].lower if stated.lower is None else max(stated.lower, out[k].lower)
-            upper = out[k].upper if stated.upper is None else min(stated.upper, out[k].upper)
-            try:
-                out[k] = replace(out[k], kind=stated.kind, a=stated.a, b=stated.b, lower=lower, upper=upper)
-            except ValueError as error:
-                raise InputError(where, str(error), "change it, or widen the bounds of the identification") from None
-    return tuple(out)
 
 
 def _keep_whole(context: Context, found: Posterior, likelihood: Likelihood, arrays: dict[str, Any]) -> None:

@@ -40,7 +40,7 @@ def summarise(study: Study, done: Mapping[str, Saved], seed: int) -> dict[str, A
     if "posterior" in done:
         out["convergence"] = done["posterior"].data["convergence"]
         out["posterior"] = {"prior_space": SPACE} | {
-            key: done["posterior"].data.get(key) for key in ("stage", "stage_why", "likelihood", "second_stage")}
+            key: done["posterior"].data.get(key) for key in ("stage", "stage_why", "likelihood", "second_stage", "groups")}
     if "predict" in done:
         out["heldout"] = _heldout(done["predict"])
         out["backbone"] = done["predict"].data.get("backbone", {})

@@ -95,6 +95,14 @@ starts = 20
 [posterior]
 # stage = "both"                  # "regression" (Eq. 13), "forward" (recordings simulated), or both; by default both where that is quick
 ensembles = 4                     # independent ensembles of walkers; they go on until converged (or steps = ..., most = ...)
+# [[posterior.priors]]            # instead of the default: normal (mean, sd), lognormal (median, log_sd), uniform, loguniform, ...
+# parameter = "cubic[*].c"        # in its own unit, * stands for any part
+# kind = "normal"
+# mean = 0.0
+# sd = 1e8
+# [[posterior.groups]]            # joints that are nominally equal: values scatter around a common one, both unknown
+# parameters = ["iwan4_memory[*].k_t"]
+# scatter = 0.3                   # between the joints: of the natural logarithm, or in the unit of a signed coefficient
 
 [prediction]
 at = "x"                          # whose amplitude the backbone is drawn against
