@@ -7,10 +7,10 @@ import pytest
 
 from bayes_nlsid.mismatch.answer import _alike
 from bayes_nlsid.mismatch.catalogue import ROWS
-from bayes_nlsid.mismatch.laws import Size
+from bayes_nlsid.mismatch.laws import Size, power_onset
 from bayes_nlsid.mismatch.recorded_answer import onset_of
 from bayes_nlsid.mismatch.suspects import Suspect
-from bayes_nlsid.mismatch.words import error_percent, known, power_onset, separates, size_of, sure, whole_percent
+from bayes_nlsid.mismatch.words import error_percent, known, separates, size_of, sure, whole_percent
 
 ORDERED = [((("hardening", "TIP_w"),), 0.6), ((("clearance", "TIP_w"),), 0.25), ((("added_mass", "P1"), ("hardening", "TIP_w")), 0.1),
            ((("other", "-"),), 0.04), ((), 0.01)]
@@ -47,7 +47,7 @@ def test_places_stand_for_one_another_only_with_one_class_and_not_together() -> 
 
 def test_a_power_spring_sets_in_where_a_tenth_of_its_stiffness_is_there() -> None:
     peak, n = 3e-4, 5.0
-    d = np.array([power_onset(peak, n), peak])
+    d = np.array([power_onset(np.array([1.0, 1.0, n]), peak), peak])
     stiffness = d ** (n - 1)
     assert stiffness[0] / stiffness[1] == pytest.approx(0.1)
 

@@ -35,7 +35,7 @@ def marched(names, values, dt, seconds=0.4, still=((0.0, 0.0), (0.0, 0.0)), mode
     own, forced = propagators(OMEGA[modes], ZETA[modes], dt)
     g, b = np.zeros((len(t), len(names))), np.ascontiguousarray(ROWS[:len(names), modes])
     static = np.ascontiguousarray(np.array(still)[:len(names), :len(names)])
-    lost = march_modes(q0, v0, own, forced, b, static, np.array([c[0] for c in codes]),
+    lost = march_modes(q0, v0, own, forced, b, static, dt, np.array([c[0] for c in codes]),
                        np.array([c[1] for c in codes]), np.array(values, dtype=float), g, np.zeros((2, b.shape[1])), np.zeros(len(names)))
     assert lost == 0
     return t, g
@@ -89,8 +89,33 @@ def test_it_converges_with_second_order_to_what_an_integrator_finds(names, value
     assert errors[2] < errors[0] / (10 if smooth else 4)
 
 
-def test_a_mode_far_above_acts_as_a_spring():
+@pytest.mark.parametrize(("names", "values"), [(("cubic",), [[4e10]]), (("v|v|",), [[4e5]]), (("cubic", "v|v|"), [[4e10, 0.0], [4e5, 0.0]])],
+                         ids=lambda x: "+".join(x) if isinstance(x[0], str) else "")
+def test_a_mode_far_above_acts_as_a_spring(names, values):
+    """Also before a damper, which then acts on the speed at which the spring yields."""
     high = ROWS[:, 2:] / OMEGA[2]
-    t, whole = marched(("cubic",), [[4e10]], 5e-5)
-    _, short = marched(("cubic",), [[4e10]], 5e-5, still=high @ high.T, modes=slice(0, 2))
+    t, whole = marched(names, values, 5e-5)
+    _, short = marched(names, values, 5e-5, still=high @ high.T, modes=slice(0, 2))
     assert np.abs(whole - short).max() < 0.05 * np.abs(whole).max()
+
+
+def test_the_speed_of_a_spring_is_of_second_order():
+    """A damper behind nothing but a spring that moves as it is told: a first-order equation for the force."""
+    flexibility, strength = 1e-4, 300.0
+
+    def marched_alone(dt):
+        t = dt * np.arange(1, round(0.2 / dt) + 1)
+        q0, v0 = 1e-3 * (1 - np.cos(200 * t))[:, None], 0.2 * np.sin(200 * t)[:, None]
+        g = np.zeros((len(t), 1))
+        code = law_code(LIBRARY["v|v|"])
+        march_modes(q0, v0, np.zeros((4, 0)), np.zeros((4, 0)), np.zeros((1, 0)), np.array([[flexibility]]), dt, np.array([code[0]]),
+                    np.array([code[1]]), np.array([[strength]]), g, np.zeros((2, 0)), np.zeros(1))
+        return t, g[:, 0]
+
+    found = solve_ivp(lambda t, g: (0.2 * np.sin(200 * t) - np.sign(g) * np.sqrt(np.abs(g) / strength)) / flexibility, (0, 0.2), [0.0],
+                      method="LSODA", rtol=1e-10, atol=1e-12, dense_output=True)
+    errors = []
+    for dt in (4e-4, 2e-4, 1e-4):
+        t, g = marched_alone(dt)
+        errors.append(np.abs(g - found.sol(t)[0]).max() / np.abs(g).max())
+    assert errors[2] < 5e-3 and errors[2] < errors[0] / 6

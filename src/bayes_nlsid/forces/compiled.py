@@ -81,7 +81,8 @@ _PLAIN: tuple[Callable[..., Any], ...] = (laws.spring, laws.dashpot, laws.jenkin
 _OF_JOINTS: tuple[Callable[..., Any], ...] = (
     joint_laws.power_spring, joint_laws.falling_spring, joint_laws.levelling, joint_laws.saturating, joint_laws.rounded_gap,
     joint_laws.one_stop, joint_laws.two_stops, joint_laws.one_sided, joint_laws.bent, joint_laws.closing, joint_laws.rounded_friction,
-    joint_laws.falling_friction, joint_laws.power_damper, joint_laws.exponential_spring, joint_laws.round_stops)
+    joint_laws.falling_friction, joint_laws.power_damper, joint_laws.exponential_spring, joint_laws.round_stops,
+    joint_laws.loosening, joint_laws.lossy_stop, joint_laws.lossy_stops, joint_laws.levelling_damper)
 for _part in (joint_laws.soft, joint_laws.step):
     numba.extending.register_jitable(_part)
 for _module, _group in ((laws, (*_FAMILIES, *_PLAIN)), (joint_laws, _OF_JOINTS)):
@@ -154,8 +155,20 @@ def _joint_law_value(code: int, q: float, v: float, p: NDArray[np.float64]) -> t
     if code == 13:
         slope = joint_laws.exponential_spring_slope(q, v, p[0], p[1])
         return joint_laws.exponential_spring(q, v, p[0], p[1]), slope[0], slope[1]
-    slope = joint_laws.round_stops_slope(q, v, p[0], p[1], p[2])
-    return joint_laws.round_stops(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 14:
+        slope = joint_laws.round_stops_slope(q, v, p[0], p[1], p[2])
+        return joint_laws.round_stops(q, v, p[0], p[1], p[2]), slope[0], slope[1]
+    if code == 15:
+        slope = joint_laws.loosening_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.loosening(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    if code == 16:
+        slope = joint_laws.lossy_stop_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.lossy_stop(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    if code == 17:
+        slope = joint_laws.lossy_stops_slope(q, v, p[0], p[1], p[2], p[3])
+        return joint_laws.lossy_stops(q, v, p[0], p[1], p[2], p[3]), slope[0], slope[1]
+    slope = joint_laws.levelling_damper_slope(q, v, p[0], p[1], p[2])
+    return joint_laws.levelling_damper(q, v, p[0], p[1], p[2]), slope[0], slope[1]
 
 
 @compiled

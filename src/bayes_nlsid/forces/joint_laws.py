@@ -74,6 +74,17 @@ def saturating_slope(q: Value, v: Value, k: Value, d: Value, m: Value) -> Value:
     return -levelling_slope(q, v, k, d, m)[0], 0.0
 
 
+def loosening(q: Value, v: Value, k: Value, d: Value, m: Value, p: Value) -> Value:
+    """−k q (1 − (1 + r)^−p) with r = (|q|/d)^m."""
+    return -k * q * (1.0 - (1.0 + (np.abs(q) / d) ** m) ** -p)
+
+
+def loosening_slope(q: Value, v: Value, k: Value, d: Value, m: Value, p: Value) -> Value:
+    """−k (1 − (1 + r)^−p + p m r (1 + r)^(−p−1))."""
+    r = (np.abs(q) / d) ** m
+    return -k * (1.0 - (1.0 + r) ** -p + p * m * r * (1.0 + r) ** (-p - 1.0)), 0.0
+
+
 def rounded_gap(q: Value, v: Value, k: Value, e: Value, w: Value) -> Value:
     """A gap e on both sides, rounded over w e."""
     return k * w * e * (soft((q - e) / (w * e)) - soft((-q - e) / (w * e)))
@@ -104,6 +115,34 @@ def round_stops_slope(q: Value, v: Value, k: Value, e: Value, n: Value) -> Value
     """k n max(|q|/e − 1, 0)^(n−1)."""
     y = np.abs(q) / e - 1.0
     return k * n * where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0), 0.0
+
+
+def lossy_stop(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
+    """k e y^n max(1 + sgn(k) v/u, 0) with y = max(sgn(k) q/e − 1, 0) (Hunt and Crossley, J. Appl. Mech. 42, 1975)."""
+    side = np.sign(k)
+    return k * e * np.maximum(side * q / e - 1.0, 0.0) ** n * np.maximum(1.0 + side * v / u, 0.0)
+
+
+def lossy_stop_slope(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
+    """Stiffness that grows with the speed of approach, damping that grows with the pressure."""
+    side = np.sign(k)
+    y, loss = side * q / e - 1.0, np.maximum(1.0 + side * v / u, 0.0)
+    pressed = where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0)
+    return np.abs(k) * n * pressed * loss, np.abs(k) * e * pressed * np.maximum(y, 0.0) / u * where(loss > 0.0, 1.0, 0.0)
+
+
+def lossy_stops(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
+    """k e s y^n max(1 + s v/u, 0) with y = max(|q|/e − 1, 0) and s = sgn(q) (Hunt and Crossley, J. Appl. Mech. 42, 1975)."""
+    side = np.sign(q)
+    return k * e * side * np.maximum(np.abs(q) / e - 1.0, 0.0) ** n * np.maximum(1.0 + side * v / u, 0.0)
+
+
+def lossy_stops_slope(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
+    """Stiffness that grows with the speed of approach, damping that grows with the pressure."""
+    side = np.sign(q)
+    y, loss = np.abs(q) / e - 1.0, np.maximum(1.0 + side * v / u, 0.0)
+    pressed = where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0)
+    return k * n * pressed * loss, k * e * pressed * np.maximum(y, 0.0) / u * where(loss > 0.0, 1.0, 0.0)
 
 
 def two_stops(q: Value, v: Value, k: Value, e: Value, r: Value, u: Value) -> Value:
@@ -178,3 +217,13 @@ def power_damper(q: Value, v: Value, f: Value, w: Value, n: Value) -> Value:
 def power_damper_slope(q: Value, v: Value, f: Value, w: Value, n: Value) -> Value:
     """f n/w (|v|/w)^(n−1), for n > 1."""
     return 0.0, f * n / w * (np.abs(v) / w) ** (n - 1.0)
+
+
+def levelling_damper(q: Value, v: Value, c: Value, w: Value, m: Value) -> Value:
+    """c v r/(1 + r) with r = (|v|/w)^m."""
+    return levelling(v, q, c, w, m)
+
+
+def levelling_damper_slope(q: Value, v: Value, c: Value, w: Value, m: Value) -> Value:
+    """c r (1 + m + r)/(1 + r)²."""
+    return 0.0, levelling_slope(v, q, c, w, m)[0]

@@ -17,7 +17,7 @@ from bayes_nlsid.mismatch.portrait import portrait
 from bayes_nlsid.mismatch.probability import STRANGE as OTHER
 from bayes_nlsid.mismatch.probability import Key, Layer, classes_of
 from bayes_nlsid.mismatch.prove import Predictor, envelope
-from bayes_nlsid.mismatch.words import PHASES, error_percent, power_onset, separates, size_of, sure, whole_percent
+from bayes_nlsid.mismatch.words import PHASES, error_percent, separates, size_of, sure, whole_percent
 
 Array = NDArray[np.float64]
 LISTED = 12  # hypotheses that are listed place by place
@@ -132,26 +132,10 @@ def _onset(analysis: Analysis, best: Rival) -> tuple[float, str]:
         return 0.0, "m"
     e = best.hypothesis.forces[0]
     unit = "rad" if "rot" in e.place.lower() else "m"
-    if e.law is None:
+    if e.law is None or e.law.onset is None:
         return 0.0, unit
-    name = e.law.term.name
-    v = e.values
-    if name == "clearance":
-        return float(v[1]) / 2, unit
-    if name in ("rounded_gap", "one_stop", "two_stops", "round_stops"):
-        return float(v[1]), unit
-    if name in ("one_sided_spring", "bent_spring"):
-        return abs(float(v[1] * v[-1])), unit
-    if name == "exponential_spring":
-        return float(v[1]), unit
-    if name in ("saturating_spring", "levelling_spring"):
-        return 0.1 * float(v[1]), unit
-    if name in ("iwan4_memory", "jenkins_memory", "bouc_wen_loop"):
-        return (0.1 if name.startswith("iwan") else 1.0) * float(v[0] / max(v[1], 1e-300)), unit
     latent = next((x for x in analysis.found.latents if x.place == e.place), None)
-    if name in ("power_spring", "falling_spring") and latent is not None:
-        return power_onset(float(np.abs(latent.displacement).max()), float(v[2])), unit
-    return 0.0, unit
+    return e.law.onset(e.values, 0.0 if latent is None else float(np.abs(latent.displacement).max())), unit
 
 
 def _band(analysis: Analysis, best: Rival | None) -> list[float]:

@@ -37,7 +37,8 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
     lost, closed = 0, not paths.periodic
     for _ in range(passes if paths.periodic else 1):
         begun = state.copy()
-        lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, codes, powers, values, g, state, before)
+        lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, paths.dt / paths.marched, codes, powers, values, g,
+                           state, before)
         if paths.marched < FINEST and _rings(g):
             return march_laws(replace(paths, marched=4 * paths.marched), record, laws, start, passes)
         if not np.abs(g).max() < HUGE:

@@ -18,7 +18,7 @@ from bayes_nlsid.mismatch.recorded import Evidence, Progress, analyse, silent, s
 from bayes_nlsid.mismatch.recorded_portrait import portrait
 from bayes_nlsid.mismatch.suspects import Suspect
 from bayes_nlsid.mismatch.weigh import Weighed, spread
-from bayes_nlsid.mismatch.words import PHASES, WORTH_SAYING, claims, known, of_linear, power_onset, separates, size_of, sure, whole_percent
+from bayes_nlsid.mismatch.words import PHASES, WORTH_SAYING, claims, known, of_linear, separates, size_of, sure, whole_percent
 
 Array = NDArray[np.float64]
 LISTED = 16
@@ -198,25 +198,9 @@ def _band(found: Evidence, best: Weighed | None) -> list[float]:
 
 def onset_of(suspect: Suspect, p: Array) -> float:
     """Motion (m) above which a law departs from a linear one; 0 for laws that act at any motion."""
-    if suspect.law is None:
+    if suspect.law is None or suspect.law.onset is None:
         return 0.0
-    name = suspect.law.term.name
-    size = suspect.size.displacement if suspect.size is not None else 0.0
-    if name == "clearance":
-        return float(p[1]) / 2
-    if name == "one_sided_spring":
-        return abs(float(p[1])) * float(p[2])
-    if name in ("rounded_gap", "one_stop", "two_stops", "round_stops"):
-        return float(p[1])
-    if name == "exponential_spring":
-        return float(p[1])
-    if name in ("saturating_spring", "levelling_spring"):
-        return 0.1 * float(p[1])
-    if name in ("iwan4_memory", "jenkins_memory"):
-        return (0.1 if name.startswith("iwan") else 1.0) * float(p[0] / max(p[1], 1e-300))
-    if name == "bouc_wen":
-        return min(0.1 / max(abs(float(p[1])) * (abs(float(p[2])) + abs(float(p[3]))), 1e-300), size)
-    return power_onset(suspect.size.peak, float(p[2])) if name in ("power_spring", "falling_spring") and suspect.size is not None else 0.0
+    return suspect.law.onset(p, 0.0 if suspect.size is None else suspect.size.peak)
 
 
 def _each(found: Evidence) -> list[dict[str, Any]]:

@@ -22,13 +22,20 @@ from bayes_nlsid.mismatch.observer import ORDER
 
 Array = NDArray[np.float64]
 FINER = 4   # force laws are evaluated so many times finer than the records: what they make above the analysed band must not fold back
+
+
+def _bent_by(p: Array, peak: float) -> float:
+    """Motion at which a Bouc–Wen loop has lost a tenth of its stiffness."""
+    return min(0.1 / max(abs(float(p[1])) * (abs(float(p[2])) + abs(float(p[3]))), 1e-300), peak)
+
+
 # Loops whose branches stiffen or soften. With nu = 1 the force scales with alpha alone; beta and gamma act as a product.
 BOUC_WEN = Law(LIBRARY["bouc_wen"], lambda z: np.array([[1.0, b / z.displacement, 1.0, d, 1.0] for b in (0.3, 1.0, 3.0)
                                                         for d in (-1.6, -1.2, -0.5, 0.5)]),
-               ("log", "log", "fixed", "linear", "fixed"), (0,), excess=True)
+               ("log", "log", "fixed", "linear", "fixed"), (0,), _bent_by, excess=True)
 # Largest gap over the largest motion, and largest rounding of its faces: beyond them the law is a smooth hardening spring.
 GAPS = {("clearance", "d"): 1.8, ("rounded_gap", "e"): 0.9, ("rounded_gap", "w"): 0.2, ("one_stop", "e"): 0.9, ("two_stops", "e"): 0.9,
-        ("round_stops", "e"): 0.9}
+        ("round_stops", "e"): 0.9, ("lossy_stop", "e"): 0.9, ("lossy_stops", "e"): 0.9}
 FORCES = ("hardening", "softening", "clearance", "asymmetric", "coulomb", "quad_damping", "hysteresis")
 
 

@@ -79,11 +79,6 @@ def whole_percent(p: float) -> str:
     return "< 1 %" if p < 0.005 else "> 99 %" if 0.995 < p < 1 else f"{100 * p:.0f} %"
 
 
-def power_onset(peak: float, exponent: float) -> float:
-    """Displacement at which a power spring has a tenth of the stiffness that it has at the largest one."""
-    return float(peak * 0.1 ** (1 / max(exponent - 1, 0.1)))
-
-
 def sure(p: float) -> str:
     """``= 0.93``, or ``> 0.999``."""
     return "> 0.999" if p > 0.999 else "< 0.001" if p < 0.001 else f"= {p:.3g}"

@@ -57,7 +57,7 @@ def _add_force(state: np.ndarray, b: np.ndarray, forced: np.ndarray, force: np.n
 
 @partial(compiled, fastmath={"contract", "reassoc", "nsz"})
 def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndarray, b: np.ndarray, yielding: np.ndarray,
-                codes: np.ndarray, powers: np.ndarray, values: np.ndarray, g: np.ndarray, state: np.ndarray, before: np.ndarray) -> int:
+                dt: float, codes: np.ndarray, powers: np.ndarray, values: np.ndarray, g: np.ndarray, state: np.ndarray, before: np.ndarray) -> int:
     """Forces of the laws at every step.
 
     Parameters
@@ -69,7 +69,10 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
     b : ndarray (J, m)
         Mass-normalised modal rows of the places.
     yielding : ndarray (J, J)
-        Static flexibility among the places of the modes that are too high to be marched, m/N.
+        Static flexibility among the places of the modes that are too high to be marched, m/N. It yields to a force at once, and its
+        speed is that of the force: the difference of second order backwards.
+    dt : float
+        Length of a step, s.
     codes, powers : ndarray (J,)
         From ``forces.compiled.law_code``.
     values : ndarray (J, p)
@@ -92,7 +95,7 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
     direct_q, direct_v = np.zeros((2, 2)), np.zeros((2, 2))
     for j in range(places):
         for k in range(places):
-            direct_q[j, k] = yielding[j, k]
+            direct_q[j, k], direct_v[j, k] = yielding[j, k], 1.5 * yielding[j, k] / dt
             for m in range(modes):
                 direct_q[j, k] += b[j, m] * b[k, m] * forced[1, m]
                 direct_v[j, k] += b[j, m] * b[k, m] * forced[3, m]
@@ -128,6 +131,8 @@ def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndar
         q[0], q[1], v[0], v[1] = qa, qb, va, vb
         for j in range(places):
             q[j], v[j], x[j] = q0[i, j] - q[j], v0[i, j] - v[j], 2.0 * old[j] - older[j]
+            for k in range(places):
+                v[j] += yielding[j, k] * (2.0 * old[k] - 0.5 * older[k]) / dt
         solved = False
         for _ in range(60):
             f0, k0, c0 = law_value(codes[0], powers[0], q[0] - direct_q[0, 0] * x[0] - direct_q[0, 1] * x[1],
