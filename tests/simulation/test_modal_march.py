@@ -89,7 +89,8 @@ def test_it_converges_with_second_order_to_what_an_integrator_finds(names, value
     assert errors[2] < errors[0] / (10 if smooth else 4)
 
 
-@pytest.mark.parametrize(("names", "values"), [(("cubic",), [[4e10]]), (("v|v|",), [[4e5]]), (("cubic", "v|v|"), [[4e10, 0.0], [4e5, 0.0]])],
+@pytest.mark.parametrize(("names", "values"), [(("cubic",), [[4e10]]), (("v|v|",), [[4e5]]),
+                                               (("cubic", "v|v|"), [[4e10, 0.0], [4e5, 0.0]])],
                          ids=lambda x: "+".join(x) if isinstance(x[0], str) else "")
 def test_a_mode_far_above_acts_as_a_spring(names, values):
     """Also before a damper, which then acts on the speed at which the spring yields."""

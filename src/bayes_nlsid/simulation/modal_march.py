@@ -57,7 +57,8 @@ def _add_force(state: np.ndarray, b: np.ndarray, forced: np.ndarray, force: np.n
 
 @partial(compiled, fastmath={"contract", "reassoc", "nsz"})
 def march_modes(q0: np.ndarray, v0: np.ndarray, own: np.ndarray, forced: np.ndarray, b: np.ndarray, yielding: np.ndarray,
-                dt: float, codes: np.ndarray, powers: np.ndarray, values: np.ndarray, g: np.ndarray, state: np.ndarray, before: np.ndarray) -> int:
+                dt: float, codes: np.ndarray, powers: np.ndarray, values: np.ndarray, g: np.ndarray, state: np.ndarray,
+                before: np.ndarray) -> int:
     """Forces of the laws at every step.
 
     Parameters
