@@ -73,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("study", metavar="STUDY.toml")
     diagnose = add("diagnose", "where model and recordings differ, and what was probably left out", _diagnose, out=True)
     diagnose.add_argument("study", metavar="PATH", help="study file, or case folder")
+    diagnose.add_argument("--hypotheses", metavar="FILE.toml", help="hypotheses of your own, weighed beside those of the catalogue")
     for name, what in (("compare", "scenarios S1–S3 and alternatives scored on records that none of them was fitted to"),
                        ("montecarlo", "parameter distributions to backbone bands and Sobol indices"),
                        ("frf", "stepped-sine response curves with posterior bands")):
@@ -85,7 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("out", type=_named, metavar="DIR")
     report.add_argument("--format", choices=("html", "markdown"), default="html", help="markdown also writes report.md")
     add("terms", "the library of force laws as a table", _terms)
-    add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses)
+    add("hypotheses", "the catalogue of what may be missing from a model, as a table", _hypotheses).add_argument(
+        "own", metavar="FILE.toml", nargs="?", help="with hypotheses of your own, checked as nlsid diagnose --hypotheses reads them")
     new = add("new", "write a commented study to start from", _new)
     new.add_argument("out", type=_named, metavar="DIR")
     new.add_argument("--from", dest="files", nargs="+", metavar="FILE", default=[],
@@ -244,16 +246,19 @@ def _diagnose(options: argparse.Namespace) -> int:
     from bayes_nlsid.study.diagnosing import lines, run_diagnosis
 
     out = Path(options.out)
-    found = run_diagnosis(options.study, out, seed=options.seed, reporter=_reporter(options, out))
+    found = run_diagnosis(options.study, out, seed=options.seed, hypotheses=options.hypotheses, reporter=_reporter(options, out))
     if not options.quiet:
         print(lines(found) + f"\n\nin {out}: report.html, diagnosis.json, predictions.npz, figures/")
     return REFUSED if found.verdict == "cannot_tell" else DONE
 
 
 def _hypotheses(options: argparse.Namespace) -> int:
+    from bayes_nlsid.mismatch.catalogue import with_rows
+    from bayes_nlsid.study.hypotheses import read_hypotheses
     from bayes_nlsid.study.screen import hypotheses_table
 
-    print(hypotheses_table())
+    with with_rows(read_hypotheses(options.own) if options.own else ()):
+        print(hypotheses_table())
     return DONE
 
 

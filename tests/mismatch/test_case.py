@@ -147,3 +147,40 @@ def test_mains_hum_is_heard_where_bursts_have_died_away(folder: Path, sort: str)
         assert found[0].place == "S2" and found[0].gain > 100
     else:
         assert not found or found[0].gain < 12
+
+
+@pytest.mark.parametrize(("keys", "words"), [
+    ({"excited_lines": [1, None]}, "excited_lines: is not a list of whole numbers"),
+    ({"excited_lines": [1e400]}, "excited_lines: is not a list of whole numbers"),
+    ({"tolerances": {"E_rel_sd": "x"}}, "tolerances.E_rel_sd: is not a number above zero"),
+    ({"tolerances": [1]}, "tolerances: is not a table"), ({"period_s": [1]}, "period_s: is not a number"),
+    ({"band_hz": ["a", "b"]}, "band_hz: is not a pair"), ({"classes": "hardening"}, "classes: is not a list of names"),
+    ({"locations": {"sensors": "S1"}}, "locations.sensors: is not a list of names"), ({"mains_hz": "fifty"}, "mains_hz: is not a number"),
+    ({"records": [{"name": "../low"}]}, "is not the name of a file in the folder"),
+    ({"records": [{"name": "low", "level": "loud"}]}, "records, level of 'low': is not a number"),
+    ({"records": [{"name": "low", "sealed": "no"}]}, "records, sealed of 'low': is not true or false")])
+def test_fields_of_another_kind_are_refused_by_both_readers(folder: Path, keys: dict[str, object], words: str) -> None:
+    change(folder, **keys)
+    for read in (read_case, needs_general):
+        with pytest.raises(InputError) as error:
+            read(folder)
+        assert words in str(error.value) and "case.json" in str(error.value)
+
+
+def test_null_is_as_good_as_left_out(folder: Path) -> None:
+    meta = json.loads((folder / "case.json").read_text())
+    meta["records"][-1]["start_s"] = None
+    change(folder, mains_hz=None, tolerances={"E_rel_sd": None}, records=meta["records"])
+    case = read_case(folder)
+    assert case.mains == 50.0 and case.tolerances["E_rel_sd"] == 0.03
+
+
+def test_torn_archives_are_refused_in_one_sentence(folder: Path) -> None:
+    for name in ("low.npz", "nominal.npz"):
+        data = (folder / name).read_bytes()
+        for torn in (b"", b"text", data[:len(data) // 2], data[:100] + b"x" + data[101:]):
+            (folder / name).write_bytes(torn)
+            for read in (read_case, needs_general):
+                with pytest.raises(InputError, match=name):
+                    read(folder)
+        (folder / name).write_bytes(data)

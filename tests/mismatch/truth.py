@@ -127,6 +127,8 @@ def march(P: Array, Q: Array, force: Array, middle: Array, shaker: Array, b: Arr
         elif law == 9:
             # relaxing branch: force follows stretch and decays with p[1] seconds
             g = last_g * np.exp(-p[2] / p[1]) + p[0] * (d - last_d)
+        elif law == 10:
+            g = p[0] * np.sin(d / p[1])
         ahead = 1.5 * g - 0.5 * last_g
         if k % keep == 0:
             for i in range(m):
@@ -162,7 +164,7 @@ def refine(signal: Array, shift: float) -> Array:
 
 LAWS = {"hardening": 1, "softening": 2, "clearance": 3, "asymmetric": 4, "coulomb": 5, "quad_damping": 6, "hysteresis": 7,
         "stiffness_drift": 8,
-        "maxwell": 9}
+        "maxwell": 9, "cogging": 10}
 
 
 def write_case(folder: Path, cls: str = "none", place: str = "-", strength: float = 0.1, seed: int = 0, noise: float = 0.005,
@@ -363,7 +365,8 @@ def _tune(plant: dict, modes: tuple[Array, Array], cls: str, place: str, strengt
     stiff = 1 / float(plant["vectors"][place] @ np.linalg.solve(plant["K"], plant["vectors"][place]))
     limits = x * np.array([0.15, 0.4, 0.8, 1.3, 2.0, 3.0])
     base = {1: [stiff * x, x, 3.0], 2: [stiff, 1.5 * x, 0], 3: [stiff, 1.7 * x, 0], 4: [stiff, 0.3 * x, 0], 5: [stiff * x, 0.05 * w, 0],
-            6: [stiff * x, w, 2.0], 7: [stiff, 0, 0], 8: [stiff, 0, 0], 9: [stiff, 8e-4, 1 / (RATE * FINER)]}[law]
+            6: [stiff * x, w, 2.0], 7: [stiff, 0, 0], 8: [stiff, 0, 0], 9: [stiff, 8e-4, 1 / (RATE * FINER)],
+            10: [stiff * x, 0.35 * x, 0]}[law]
     low, high = np.log(1e-5), np.log(3.0)
     p = np.array(base)
     for _ in range(11):

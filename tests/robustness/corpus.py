@@ -20,6 +20,7 @@ from bayes_nlsid.study.template import TEXT
 
 RNG = np.random.default_rng(0)
 T = np.arange(40) / 500
+LONG = np.random.default_rng(1).normal(size=160)
 ACC, FORCE = RNG.normal(size=(40, 2)), RNG.normal(size=40)
 M, K = np.eye(3), np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 2.0]])
 
@@ -153,15 +154,38 @@ def good(name: str) -> bytes:
         "a.npz": lambda: npz(acc=ACC, force=FORCE, fs=np.array(500.0)), "a.csv": lambda: text(",", "."), "b.csv": lambda: text(";", ","),
         "a.tsv": lambda: text("\t", "."), "a.uff": lambda: universal(58), "b.uff": lambda: universal(58, 1), "m.uff": lambda: universal(55),
         "m.csv": MODES.encode, "a.mtx": MARKET.encode, "d.mtx": DENSE.encode, "b.mtx": ABAQUS.encode, "a.rua": boeing,
-        "l.csv": LOCATIONS.encode, "l.toml": LOCATIONS_TOML.encode, "nominal.npz": lambda: npz(M=M, K=K, sensor_select=np.eye(3)[:1]),
+        "l.csv": LOCATIONS.encode, "l.toml": LOCATIONS_TOML.encode,
+        "nominal.npz": lambda: npz(M=M, K=K, sensor_select=np.eye(3)[:1], shaker_vector=np.eye(3)[0]),
+        "case.json": CASE.encode, "mine.toml": HYPOTHESES.encode,
+        "run.npz": lambda: npz(time=np.arange(len(LONG)) / 500.0, accel=LONG[:, None], force=LONG),
         "study.toml": TEXT.encode, "beam.toml": BEAM.encode,
         "a.mat": lambda: matlab(True), "b.mat": lambda: matlab(False), "c.mat": lambda: hdf5(512), "a.h5": lambda: hdf5(0), "a.tdms": tdms,
         "a.op4": lambda: output4(False), "b.op4": lambda: output4(True), "a.pch": DMIG.encode}
     return bytes(made[name]())
 
 
+CASE = """{"case": "small", "fs_hz": 500.0, "period_s": 0.0, "mains_hz": 50, "nominal_damping_ratio": 0.01, "band_hz": [5, 100],
+ "excited_lines": [10, 11], "classes": ["none", "hardening"], "tolerances": {"E_rel_sd": 0.03},
+ "locations": {"sensors": ["S1"], "joints": ["J1"], "mass_points": ["P1", "SHAKER"]},
+ "geometry": {"sensors": [{"name": "S1", "mass_point": "P1"}]},
+ "records": [{"name": "run", "level": 1.0, "kind": "random", "start_s": 0.0, "sealed": false}]}
+"""
+HYPOTHESES = """[[hypotheses]]
+name = "stribeck"
+claim = "friction at {place} falls once it slides"
+law = "f*tanh(v/w)*(1 + a*exp(-(v/w)**2))"
+params = { f = ["N", "force"], w = ["m/s", "velocity"], a = ["", "range", 0.0, 2.0] }
+start = { w = [0.1, 1.0], a = [0.5] }
+fixed = ["w"]
+follows = "velocity"
+prior = 0.5
+confused = ["coulomb"]
+test = "a slow ramp"
+"""
+
+CASE_FILES = ("nominal.npz", "case.json", "run.npz")
 READ_HERE = ("a.npz", "a.csv", "b.csv", "a.tsv", "a.uff", "b.uff", "m.uff", "m.csv", "a.mtx", "d.mtx", "b.mtx", "a.rua", "l.csv", "l.toml",
-             "nominal.npz")
+             "nominal.npz", "case.json", "run.npz", "mine.toml")
 READ_APART = ("a.mat", "b.mat", "c.mat", "a.h5", "a.tdms", "a.op4", "b.op4", "a.pch")
 STUDIES = ("study.toml", "beam.toml")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.mismatch.case_file import load, read_meta, under
 
 Array = NDArray[np.float64]
 TOLERANCES = {"E_rel_sd": 0.03, "rho_rel_sd": 0.01, "joint_stiffness_log_sd": 0.3, "root_fix_log_sd": 0.5, "damping_rel_sd": 0.25}
@@ -153,7 +153,7 @@ def read_case(path: str | Path) -> Case:
         With file, field and mend, for anything that makes the analysis impossible. What can be lived without becomes a note.
     """
     folder = Path(path)
-    meta = _json(folder / "case.json")
+    meta = read_meta(folder / "case.json")
     notes: list[str] = []
     rate = _number(meta, "fs_hz", folder)
     period = float(meta.get("period_s") or 0.0)
@@ -161,13 +161,13 @@ def read_case(path: str | Path) -> Case:
     count = len(model["sensor_rows"])
     records = _records(folder, meta, rate, period, count, notes)
     low, high = _band(meta, rate, folder)
-    names = tuple(str(n) for n in _under(meta, "locations").get("sensors", ())) or tuple(f"S{i + 1}" for i in range(count))
+    names = tuple(str(n) for n in under(meta, "locations").get("sensors", ())) or tuple(f"S{i + 1}" for i in range(count))
     if len(names) != count:
         raise InputError(f"{folder / 'case.json'}: locations.sensors", f"{len(names)} names for {count} rows of sensor_select",
                          "give one name per sensor")
     usable = _usable(records, names, notes)
-    tolerances = dict(TOLERANCES) | {k: float(v) for k, v in _under(meta, "tolerances").items() if k in TOLERANCES}
-    missing = sorted(set(TOLERANCES) - set(_under(meta, "tolerances")))
+    tolerances = dict(TOLERANCES) | {k: float(v) for k, v in under(meta, "tolerances").items() if k in TOLERANCES}
+    missing = sorted(set(TOLERANCES) - set(under(meta, "tolerances")))
     if missing:
         notes.append(f"Tolerances {', '.join(missing)} are not stated; usual values were taken.")
     _campaign_notes(records, notes)
@@ -176,23 +176,6 @@ def read_case(path: str | Path) -> Case:
                 model["M_parts"], names, model["sensor_rows"], model["shaker"], model["base"], model["places"],
                 _mass_points(meta, model, names, notes), tolerances, float(meta.get("nominal_damping_ratio") or 0.01),
                 tuple(meta.get("classes") or CLASSES), records, float(meta.get("mains_hz") or 50.0), usable, tuple(notes))
-
-
-def _json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(str(path), "file not found", "give the folder of a case (case.json, nominal.npz, one .npz per record)")
-    try:
-        meta = json.loads(path.read_text())
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"not valid JSON ({error})", "repair the file") from None
-    if not isinstance(meta, dict) or not isinstance(meta.get("records"), list) or not meta["records"]:
-        raise InputError(f"{path}: records", "missing or empty", "list the records with name, level, kind, start_s, sealed")
-    return meta
-
-
-def _under(meta: dict[str, Any], key: str) -> dict[str, Any]:
-    value = meta.get(key)
-    return value if isinstance(value, dict) else {}
 
 
 def _number(meta: dict[str, Any], key: str, folder: Path) -> float:
@@ -213,18 +196,8 @@ def _band(meta: dict[str, Any], rate: float, folder: Path) -> tuple[float, float
     return float(band[0]), float(band[1])
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
-    if not path.is_file():
-        raise InputError(str(path), "file not found", "put it beside case.json")
-    try:
-        with np.load(path, allow_pickle=False) as store:
-            return {key: store[key] for key in store.files}
-    except (ValueError, OSError, KeyError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "write it with numpy.savez") from None
-
-
 def _nominal(path: Path, notes: list[str]) -> dict[str, Any]:
-    raw = _load(path)
+    raw = load(path)
     for key in ("M", "K", "sensor_select", "shaker_vector"):
         if key not in raw:
             raise InputError(f"{path}: {key}", "missing", "store the matrices of the nominal model")
@@ -275,17 +248,17 @@ def _parts(raw: dict[str, NDArray[Any]], key: str, whole: Array, path: Path, not
 
 def _mass_points(meta: dict[str, Any], model: dict[str, Any], sensors: tuple[str, ...], notes: list[str]) -> dict[str, Array]:
     """Mass points carry no vectors of their own: ``P<i>`` lies under the sensor that the geometry names (else sensor i)."""
-    listed = [str(n) for n in _under(meta, "locations").get("mass_points", ())]
-    under = {}
-    for entry in _under(meta, "geometry").get("sensors", ()):
+    listed = [str(n) for n in under(meta, "locations").get("mass_points", ())]
+    below = {}
+    for entry in under(meta, "geometry").get("sensors", ()):
         if isinstance(entry, dict) and entry.get("mass_point") and entry.get("name") in sensors:
-            under[str(entry["mass_point"])] = sensors.index(entry["name"])
+            below[str(entry["mass_point"])] = sensors.index(entry["name"])
     out: dict[str, Array] = {}
     for name in listed or [f"P{i + 1}" for i in range(len(sensors))] + ["SHAKER"]:
         if name == "SHAKER":
             out[name] = model["shaker"]
-        elif name in under:
-            out[name] = model["sensor_rows"][under[name]]
+        elif name in below:
+            out[name] = model["sensor_rows"][below[name]]
         elif name[1:].isdigit() and name[0] == "P" and 0 < int(name[1:]) <= len(sensors):
             out[name] = model["sensor_rows"][int(name[1:]) - 1]
         else:
@@ -303,7 +276,7 @@ def _records(folder: Path, meta: dict[str, Any], rate: float, period: float, cou
         if not path.is_file():
             notes.append(f"Record {name} is listed but its file {path.name} is missing; it was left out.")
             continue
-        record = _record(path, entry, _load(path), rate, period, count, notes)
+        record = _record(path, entry, load(path), rate, period, count, notes)
         if record is not None:
             out.append(record)
     if not any(not r.sealed and r.kind != "off" for r in out):
@@ -330,7 +303,7 @@ def _record(path: Path, entry: dict[str, Any], raw: dict[str, NDArray[Any]], rat
     if not np.isfinite(force).all():
         notes.append(f"The force of record {name} has missing values; the record was left out.")
         return None
-    kind = _kind(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force, rate, period)
+    kind = kind_of(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force, rate, period)
     periods = 1
     if kind == "steady":
         block = round(period * rate)
@@ -341,7 +314,7 @@ def _record(path: Path, entry: dict[str, Any], raw: dict[str, NDArray[Any]], rat
     return CaseRecord(name, kind, float(entry.get("level", 1.0)), float(entry.get("start_s", 0.0)), sealed, time, force, accel, periods)
 
 
-def _kind(text: str, name: str, level: float, force: Array, rate: float, period: float) -> str:
+def kind_of(text: str, name: str, level: float, force: Array, rate: float, period: float) -> str:
     text = text.lower()
     if "off" in text or name == "noise" or level == 0:
         return "off"

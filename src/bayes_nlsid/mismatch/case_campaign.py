@@ -29,7 +29,8 @@ from bayes_nlsid.mismatch.campaign import (
     make_trial,
     parted,
 )
-from bayes_nlsid.mismatch.case import CLASSES, TOLERANCES, _json, _kind, _load, _under
+from bayes_nlsid.mismatch.case import CLASSES, TOLERANCES, kind_of
+from bayes_nlsid.mismatch.case_file import load, read_meta, under
 from bayes_nlsid.recordings.checks import check
 from bayes_nlsid.recordings.noise import noise_psd
 from bayes_nlsid.recordings.recording import Channel, Quantity, Recording
@@ -48,15 +49,15 @@ def needs_general(path: str | Path) -> bool:
     folder = Path(path)
     if not (folder / "case.json").is_file():
         return False   # the other reader says what is missing
-    meta = _json(folder / "case.json")
+    meta = read_meta(folder / "case.json")
+    raw = load(folder / "nominal.npz")
+    if "K" not in raw:
+        return False
     try:
-        with np.load(folder / "nominal.npz", allow_pickle=False) as store:
-            K = np.asarray(store["K"], dtype=float)
-            np.linalg.cholesky((K + K.T) / 2)
+        K = np.asarray(raw["K"], dtype=float)
+        np.linalg.cholesky((K + K.T) / 2)
     except (np.linalg.LinAlgError, ValueError):
         return True
-    except (OSError, KeyError):
-        return False
     if not isinstance(meta.get("band_hz"), list):
         return True
     period, rate = float(meta.get("period_s") or 0.0), float(meta.get("fs_hz") or 0.0)
@@ -66,14 +67,11 @@ def needs_general(path: str | Path) -> bool:
         file = folder / f"{name}.npz"
         if not file.is_file() or entry.get("sealed"):
             continue
-        try:
-            with np.load(file, allow_pickle=False) as raw:
-                if "accel" not in raw or "force" not in raw:
-                    return True
-                force = np.asarray(raw["force"], dtype=float).reshape(-1)
-        except (ValueError, OSError):
-            return False
-        kind = _kind(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force, rate, period)
+        raw = load(file)
+        if "accel" not in raw or "force" not in raw:
+            return True
+        force = np.asarray(raw["force"], dtype=float).reshape(-1)
+        kind = kind_of(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force, rate, period)
         if kind == "off":
             continue
         if not np.abs(force).any():
@@ -108,13 +106,14 @@ def campaign_from_case(path: str | Path) -> Campaign:
         If there is no usable model or no usable record.
     """
     folder = Path(path)
-    meta = _json(folder / "case.json")
+    meta = read_meta(folder / "case.json")
     notes: list[str] = []
     model, sensors = _model(folder, meta, notes)
     records = _records(folder, meta, sensors, notes)
     fit = [r for r, use in records if use == "fit"]
     if not fit:
-        raise InputError(f"{folder / 'case.json'}: records", "no open record could be used" + (f" ({notes[-1]})" if notes else ""),
+        why = next((note for note in reversed(notes) if "left out" in note), "")
+        raise InputError(f"{folder / 'case.json'}: records", f"no open record could be used{why and f' ({why[:-1]})'}",
                          "provide at least one record with time and accel, velocity or displacement")
     band = meta.get("band_hz")
     clock = min(r.fs for r in fit)
@@ -128,7 +127,7 @@ def campaign_from_case(path: str | Path) -> Campaign:
     trials = _trials(records, noises, (bottom, top), notes)
     model = in_band(model, top)
     places = _places(model, meta)
-    tolerances = TOLERANCES | {k: float(v) for k, v in _under(meta, "tolerances").items() if k in TOLERANCES}
+    tolerances = TOLERANCES | {k: float(v) for k, v in under(meta, "tolerances").items() if k in TOLERANCES}
     notes += campaign_notes(trials, bool(noises))
     own = {"frequency": 0.5 * float(np.hypot(tolerances["E_rel_sd"], tolerances["rho_rel_sd"])), "damping": tolerances["damping_rel_sd"],
            "gain": tolerances["rho_rel_sd"]}
@@ -141,7 +140,7 @@ def _model(folder: Path, meta: dict[str, Any], notes: list[str]) -> tuple[ModalM
     from scipy.linalg import eigh
 
     path = folder / "nominal.npz"
-    raw = _load(path)
+    raw = load(path)
     for key in ("M", "K", "sensor_select"):
         if key not in raw:
             raise InputError(f"{path}: {key}", "missing", "store the matrices of the nominal model")
@@ -173,7 +172,7 @@ def _model(folder: Path, meta: dict[str, Any], notes: list[str]) -> tuple[ModalM
     rows = np.atleast_2d(np.asarray(raw["sensor_select"], dtype=float))
     if rows.shape[-1] != size:
         raise InputError(f"{path}: sensor_select", f"has shape {rows.shape}, its last axis must be {size}", "use the order of M and K")
-    names = tuple(str(n) for n in _under(meta, "locations").get("sensors", ())) or tuple(f"S{i + 1}" for i in range(len(rows)))
+    names = tuple(str(n) for n in under(meta, "locations").get("sensors", ())) or tuple(f"S{i + 1}" for i in range(len(rows)))
     if len(names) != len(rows):
         names = tuple(f"S{i + 1}" for i in range(len(rows)))
         notes.append("The names of the sensors do not fit their number; S1, S2, ... were used.")
@@ -203,7 +202,7 @@ def _records(folder: Path, meta: dict[str, Any], sensors: tuple[str, ...], notes
             notes.append(f"Record {name} is listed but its file {file.name} is missing; it was left out.")
             continue
         try:
-            found = _record(name, entry, _load(file), meta, sensors, sealed, notes)
+            found = _record(name, entry, load(file), meta, sensors, sealed, notes)
         except (ValueError, TypeError) as error:
             notes.append(f"Record {name} was left out: {error}")
             continue
@@ -245,7 +244,7 @@ def _record(name: str, entry: dict[str, Any], raw: dict[str, NDArray[Any]], meta
                      for i in usable)
     driven = force is not None and bool(np.abs(force).any())
     period = round(float(meta.get("period_s") or 0.0) / dt)
-    kind = _kind(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force if force is not None else np.zeros(n), 1 / dt,
+    kind = kind_of(str(entry.get("kind", "")), name, float(entry.get("level", 1.0)), force if force is not None else np.zeros(n), 1 / dt,
                  float(meta.get("period_s") or 0.0))
     periodic = driven and force is not None and kind == "steady" and period > 1 and n >= period and _repeats(force, period)
     keep = n // period * period if periodic else n

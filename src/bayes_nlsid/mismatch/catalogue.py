@@ -1,11 +1,14 @@
 """The catalogue of missing physics: one row for each class of effect that a nominal model and its recordings may lack.
 
 A row says in words what it claims, which law carries the claim, where it can sit, how likely it is beforehand, what it is confused
-with and which test would separate it. Adding a class means adding a row (and, for a new kind of law, one Term).
+with and which test would separate it. Adding a class means adding a row (and, for a new kind of law, one Term); `with_rows` adds
+rows for the time of one diagnosis.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -96,10 +99,31 @@ CATALOGUE: tuple[Row, ...] = (
 )
 
 ROWS: dict[str, Row] = {row.name: row for row in CATALOGUE}
+"""The catalogue by name, with the user's own rows while they count; only `with_rows` changes it."""
+
+
+@contextmanager
+def with_rows(rows: Sequence[Row]) -> Iterator[None]:
+    """Rows of the user's own, searched, weighed and told like the others while the context lasts; for every thread of this process.
+
+    Raises
+    ------
+    ValueError
+        If a name is taken.
+    """
+    taken = [row.name for i, row in enumerate(rows) if row.name in ROWS or row.name in [other.name for other in rows[:i]]]
+    if taken:
+        raise ValueError(f"the catalogue has {', '.join(taken)} already; choose another name")
+    ROWS.update((row.name, row) for row in rows)
+    try:
+        yield
+    finally:
+        for row in rows:
+            del ROWS[row.name]
 
 
 def catalogue_rows() -> list[dict[str, str]]:
     """The catalogue as a table, all cells text: class, claim, where it sits, phase, confused with, what separates it."""
     return [{"class": r.name, "claim": r.claim.format(place="a place"), "sits": r.sits, "phase": r.phase,
              "confused with": ", ".join(r.confused), "separated by": r.test,
-             "laws": ", ".join(law.term.name for law in r.laws)} for r in CATALOGUE]
+             "laws": ", ".join(law.term.name for law in r.laws)} for r in ROWS.values()]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
-from bayes_nlsid.mismatch.catalogue import CATALOGUE
+from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.laws import Law, Size
@@ -111,7 +111,7 @@ def scan_forces(fam: Family, fit: LinearFit, evidence: Evidence, places: list[st
         weight = np.einsum("ls,ls->l", evidence.weight, np.abs(h[:, :, j]) ** 2)
         z = np.einsum("ls,ls,rls->rl", evidence.weight, h[:, :, j].conj(), data, optimize=True)
         latents.append(_latent(evidence, place, z, weight, total, moved, j, paths))
-        for row in CATALOGUE:
+        for row in ROWS.values():
             if row.kind == "force":
                 tried = [_best_shape(evidence, law, law.shapes(scale[place]), paths, moved, j, z, weight, row.name, place)
                          for law in row.laws]
@@ -139,7 +139,7 @@ def forced(fam: Family, fit: LinearFit, evidence: Evidence, place: str, size: Si
     d, v = paths.in_time(paths.linear(top))
     h = accelerance(fam, fit.fields.modes, spectra.s, fam.places[place][None], fit.shape_errors)[:, :, 0]
     out = []
-    for row in CATALOGUE:
+    for row in ROWS.values():
         for law in row.laws[:1] if row.kind == "force" else ():
             shapes = law.shapes(size)
             values = shapes[len(shapes) // 2].copy()

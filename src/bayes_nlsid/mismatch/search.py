@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
+from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.effects import Effect, pack, weakened
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
@@ -21,7 +22,7 @@ WORTH = 14.0  # smallest gain of one regression that is looked at more closely
 SECOND = 25.0  # the same for a second effect
 FIRST_FEW = 2  # linear effects that are estimated first from a linear fit that is no good
 CLEAR = 1000.0  # gain of a linear effect that its column promises nearly rightly
-KINDS = (("hardening", "softening", "clearance", "asymmetric"), ("coulomb", "quad_damping"), ("hysteresis",))
+KINDS = ("displacement", "velocity", "memory")   # what a law may follow
 CHARGED = 6.0  # the same for each parameter: less than what it will be charged
 
 
@@ -224,10 +225,16 @@ def _every_kind(chosen: list[Candidate], candidates: list[Candidate]) -> list[Ca
     spring."""
     out = list(chosen)
     for kind in KINDS:
-        best = next((c for c in candidates if c.effect.cls in kind), None)
-        if best is not None and best.gain > 0.1 * candidates[0].gain and all(c.effect.cls not in kind for c in out):
+        best = next((c for c in candidates if _follows(c, kind)), None)
+        if best is not None and best.gain > 0.1 * candidates[0].gain and not any(_follows(c, kind) for c in out):
             out.append(best)
     return out
+
+
+def _follows(c: Candidate, kind: str) -> bool:
+    """Whether a law follows the displacement, the velocity or the history."""
+    row = ROWS[c.effect.cls]
+    return row.kind == "force" and row.phase == kind
 
 
 def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]:

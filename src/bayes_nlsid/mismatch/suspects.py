@@ -36,7 +36,6 @@ BOUC_WEN = Law(LIBRARY["bouc_wen"], lambda z: np.array([[1.0, b / z.displacement
 # Largest gap over the largest motion, and largest rounding of its faces: beyond them the law is a smooth hardening spring.
 GAPS = {("clearance", "d"): 1.8, ("rounded_gap", "e"): 0.9, ("rounded_gap", "w"): 0.2, ("one_stop", "e"): 0.9, ("two_stops", "e"): 0.9,
         ("round_stops", "e"): 0.9, ("lossy_stop", "e"): 0.9, ("lossy_stops", "e"): 0.9}
-FORCES = ("hardening", "softening", "clearance", "asymmetric", "coulomb", "quad_damping", "hysteresis")
 
 
 @final
@@ -163,7 +162,7 @@ def force_suspects(bench: Bench, places: Sequence[Place], classes: Sequence[str]
                    progress: Callable[[float], None] | None = None) -> Iterator[tuple[Place, str, Law, Array, Array]]:
     """For every place, class and law: shapes (K, n_p) and their whitened innovations (K, N)."""
     for i, place in enumerate(places):
-        for cls in FORCES:
+        for cls in (row.name for row in ROWS.values() if row.kind == "force"):
             if cls not in classes:
                 continue
             for law in laws_of(cls):

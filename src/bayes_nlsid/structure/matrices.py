@@ -68,7 +68,7 @@ def read_matrices(mass: str | Path, stiffness: str | Path | None = None, damping
     if path.suffix == ".npz":
         if any(units):
             raise InputError(str(path), "units are given, but an archive is in SI", "convert it, and leave length_unit and force_unit out")
-        content = _from_archive(path, _archive(path))
+        content = _from_archive(path, read_archive(path))
     else:
         called = {"mass": mass_name, "stiffness": stiffness_name, "damping": damping_name}
         content = _from_files(path, {"stiffness": stiffness, "damping": damping}, called, units, rotations)
@@ -130,8 +130,14 @@ class _Content:
             self.roles[role].append(name)
 
 
-def _archive(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of an archive, whose declared sizes are checked before anything is unpacked."""
+def read_archive(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of an ``.npz`` archive, names among them, whose declared sizes are checked before anything is unpacked.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, too large, or holds pickled objects.
+    """
     import zipfile
 
     try:
@@ -139,7 +145,7 @@ def _archive(path: Path) -> dict[str, NDArray[Any]]:
             size = sum(m.file_size for m in members.infolist())
         if size > MAX_BYTES:
             raise InputError(str(path), f"unpacks to {size / 2**20:.0f} MiB, more than is read at once ({MAX_BYTES / 2**20:.0f} MiB)",
-                             "reduce the model first")
+                             "reduce the model, or cut the recording")
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except InputError:
@@ -218,7 +224,7 @@ def _from_files(mass: Path, others: dict[str, str | Path | None], names: dict[st
 
 def _add_locations(path: Path, content: _Content) -> None:
     if path.suffix == ".npz":
-        archive = _archive(path)
+        archive = read_archive(path)
         if "location_names" not in archive or "location_vectors" not in archive:
             raise InputError(str(path), "location_names or location_vectors missing", "save both")
         names, vectors = archive["location_names"], archive["location_vectors"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -36,8 +36,8 @@ DETECTION = {
                   "beyond three standard errors: something is there")}
 
 
-def page(found: Diagnosis, pictures: Pictures) -> str:
-    """The whole page."""
+def page(found: Diagnosis, pictures: Pictures, inputs: Sequence[tuple[str, str]] = ()) -> str:
+    """The whole page; ``inputs`` are files with their SHA-256."""
     shown = {part: "".join(html.picture(*pictures[name], f"figures/{name}.png", name.replace("_", " ")) for name in names
                            if name in pictures) for part, names in SECTIONS.items()}
     body = [f'<p class="soft">nlsid diagnose, {escape(found.case)}, seed {found.seed}, {duration(found.seconds)}</p>',
@@ -52,6 +52,8 @@ def page(found: Diagnosis, pictures: Pictures) -> str:
              "<h2>Is one linear system enough?</h2>", _detection(found)]
     if found.notes:
         body += ["<h2>What else to know</h2>", html.listing(list(found.notes))]
+    if inputs:
+        body.append(html.details("Files that this rests on", html.table(["file", "SHA-256"], [list(one) for one in inputs], "this run")))
     body.append(html.details("Versions", html.table(["package", "version"], [[k, v] for k, v in versions().items()], "this run")))
     return html.page(f"Diagnosis of {found.case}", "\n".join(part for part in body if part))
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO, final
+
+from bayes_nlsid.errors import InputError
 
 Progress = Callable[[float, str], None]
 
@@ -104,3 +107,23 @@ class Reporter:
         for path in self._logs:
             with path.open("a", encoding="utf-8") as file:
                 file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+
+
+def opening(told: Reporter, sentence: str, versions: Mapping[str, str], inputs: Sequence[tuple[str, str]]) -> None:
+    """The first lines of a log: with what, on what, and how; ``inputs`` are files with their SHA-256."""
+    told.log(f"{sentence}; " + ", ".join(f"{name} {value}" for name, value in versions.items()))
+    for name, digest in inputs:
+        told.log(f"input {name}: SHA-256 {digest}")
+
+
+@contextmanager
+def ending(told: Reporter, again: str) -> Iterator[None]:
+    """What does not come to its end says why in its log; ``again``: what the same command does after it was stopped."""
+    try:
+        yield
+    except BaseException as error:
+        why = f"stopped; the same command {again}" if isinstance(error, KeyboardInterrupt) else (
+            f"refused: {error}" if isinstance(error, InputError) else f"failed: {type(error).__name__}: {error}")
+        with suppress(OSError):  # the log may lie on the disk that is full
+            told.log(why)
+        raise

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.recordings.reading import ChannelSpec, RecordingSpec
@@ -18,7 +16,7 @@ from bayes_nlsid.study.reading_plan import read_plan
 from bayes_nlsid.study.reading_structure import read_reduction, read_structure
 from bayes_nlsid.study.schema import LinearEntry, Study
 from bayes_nlsid.study.store import file_digest
-from bayes_nlsid.study.table import FILL_IN, Table, gaps, nearest
+from bayes_nlsid.study.table import FILL_IN, Table, gaps, nearest, parse_toml
 
 ROLES = ("train", "holdout", "noise", "linear")
 QUANTITY_DIMENSION = {"acceleration": "acceleration", "velocity": "velocity", "displacement": "length", "force": "force"}
@@ -43,7 +41,7 @@ def read_study(path: Path | str) -> Study:
         On the first thing that cannot be used.
     """
     file = Path(path)
-    content = _parse(file)
+    content = parse_toml(file, "give the path of a study file, or make one with nlsid new DIR")
     left = gaps(content)
     if left:
         raise InputError(file.name, f"{len(left)} entr{'y is' if len(left) == 1 else 'ies are'} still to be filled in: {'; '.join(left)}",
@@ -80,21 +78,6 @@ def read_study(path: Path | str) -> Study:
                   report, frf, montecarlo, locations, ((file.name, file_digest(file)), *inputs), plan, compared)
     check_consistency(study, built)
     return study
-
-
-def _parse(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(str(file), "there is no such file", "give the path of a study file, or make one with nlsid new DIR") from None
-    except IsADirectoryError:
-        raise InputError(str(file), "is a folder", "give the study file inside it, for instance study.toml") from None
-    except PermissionError:
-        raise InputError(str(file), "cannot be read", "change its permissions") from None
-    except UnicodeDecodeError:
-        raise InputError(str(file), "is not UTF-8 text", "save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(str(file), f"is not valid TOML: {error}", "correct that line") from None
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -44,9 +44,8 @@ def read_terms(top: Table) -> tuple[UserTermEntry, ...]:
             raise table.wrong("name", f"{name!r} is already a term", "choose another name")
         if not re.fullmatch(r"[\w|*^-]+", name):
             raise table.wrong("name", f"{name!r} cannot be a name of a term", "use letters, digits and _, without blanks or brackets")
-        inner = table.table("params")
-        params = () if inner is None else tuple((key, _read_param(inner, key)) for key in inner.keys())
-        entry = UserTermEntry(name, formula, params, table.text("memory", "none", ("none", "masing")), table.text("meaning", ""))
+        entry = UserTermEntry(name, formula, read_params(table.table("params")), table.text("memory", "none", ("none", "masing")),
+                              table.text("meaning", ""))
         table.close()
         try:
             user_terms((entry,))
@@ -54,6 +53,11 @@ def read_terms(top: Table) -> tuple[UserTermEntry, ...]:
             raise InputError(f"{table.file.name}: {table.name} {error.where}", error.problem, error.mend) from None
         entries.append(entry)
     return tuple(entries)
+
+
+def read_params(table: Table | None) -> tuple[tuple[str, tuple[Any, ...]], ...]:
+    """``params`` of a law: every name with unit and rule, as ``user_term`` takes them; none without a table."""
+    return () if table is None else tuple((key, _read_param(table, key)) for key in table.keys())
 
 
 def _read_param(table: Table, key: str) -> tuple[Any, ...]:

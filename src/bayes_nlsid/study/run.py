@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 from bayes_nlsid.errors import InputError
 from bayes_nlsid.study.archive import keep_study, stored_study, study_text
 from bayes_nlsid.study.context import Context, Result
-from bayes_nlsid.study.progress import Reporter
+from bayes_nlsid.study.progress import Reporter, ending, opening
 from bayes_nlsid.study.report import Report, render
 from bayes_nlsid.study.report_markdown import markdown
 from bayes_nlsid.study.schema import EXTRAS, STAGES, Study
@@ -76,9 +75,10 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
         store.sweep()
         keep_study(store.stages, study, study.seed if seed is None else seed)
         told = reporter if reporter is not None else Reporter((store.out / "run.log",))
-        _opening(told, study, study.seed if seed is None else seed, workers, executor)
+        opening(told, f"{study.title}: {study.file.name}, seed {study.seed if seed is None else seed}, "
+                      f"{workers} worker{'s' if workers > 1 else ''}, {executor}", versions(), study.inputs)
         context = Context(study, study.seed if seed is None else seed, workers, executor, {}, told.update, told.note, store.scratch)
-        with _ending(told):
+        with ending(told, "goes on from here"):
             stages = [*study.stages[:-1], *([extra] if extra is not None else []), "report"]
             for number, name in enumerate(stages[:-1], start=1):
                 context.done[name] = _one(store, context, name, (number, len(stages)), fresh and extra in (None, name), told)
@@ -91,27 +91,6 @@ def run_study(study: Study, out: Path | str, *, seed: int | None = None, workers
                              *story(study, result)):
                 told.log(sentence)
     return result
-
-
-def _opening(told: Reporter, study: Study, seed: int, workers: int, executor: str) -> None:
-    """The first lines of a run in its log: with what, on what, and how."""
-    stated = ", ".join(f"{name} {value}" for name, value in versions().items())
-    told.log(f"{study.title}: {study.file.name}, seed {seed}, {workers} worker{'s' if workers > 1 else ''}, {executor}; {stated}")
-    for name, digest in study.inputs:
-        told.log(f"input {name}: SHA-256 {digest}")
-
-
-@contextmanager
-def _ending(told: Reporter) -> Iterator[None]:
-    """A run that does not come to its end says why in its log."""
-    try:
-        yield
-    except BaseException as error:
-        why = "stopped; the same command goes on from here" if isinstance(error, KeyboardInterrupt) else (
-            f"refused: {error}" if isinstance(error, InputError) else f"failed: {type(error).__name__}: {error}")
-        with suppress(OSError):  # the log may lie on the disk that is full
-            told.log(why)
-        raise
 
 
 def kept_extras(store: Store, study: Study, done: Mapping[str, Saved]) -> dict[str, Saved]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, final
@@ -36,6 +37,28 @@ def gaps(value: object, place: str = "") -> list[str]:
         asked = value.removeprefix(FILL_IN).lstrip(": ")
         return [f"[{table}] {key}" + (f" ({asked})" if asked else "")]
     return []
+
+
+def parse_toml(file: Path, mend: str) -> dict[str, Any]:
+    """What a TOML file says; ``mend`` is the advice where there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(str(file), "there is no such file", mend) from None
+    except IsADirectoryError:
+        raise InputError(str(file), "is a folder", "give the file inside it, for instance study.toml") from None
+    except PermissionError:
+        raise InputError(str(file), "cannot be read", "change its permissions") from None
+    except UnicodeDecodeError:
+        raise InputError(str(file), "is not UTF-8 text", "save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(file), f"is not valid TOML: {error}", "correct that line") from None
 
 
 @final
