@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,17 @@ import pytest
 
 from bayes_nlsid import cli
 from bayes_nlsid.errors import InputError
+from bayes_nlsid.mismatch import recorded_answer
+from bayes_nlsid.mismatch.campaign import Campaign
 from bayes_nlsid.mismatch.catalogue import CATALOGUE, ROWS, with_rows
+from bayes_nlsid.mismatch.diagnosis import Diagnosis
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.study.diagnosing import run_diagnosis
 from bayes_nlsid.study.hypotheses import read_hypotheses
-from tests.mismatch.test_recorded import STIFFNESS, nothing, write_single
+from tests.mismatch.test_recorded import STIFFNESS, write_single
 from tests.mismatch.truth import write_case
+from tests.robustness.corpus import CASE_FILES, good
+from tests.study.test_study_diagnosing import answer
 
 COGGING = """[[hypotheses]]
 name = "cogging"
@@ -116,13 +121,25 @@ def test_a_file_that_is_refused_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "why").exists()
 
 
-def test_the_log_of_a_diagnosis_tells_a_colleague_what_was_done(tmp_path: Path) -> None:
-    write_single(tmp_path / "c", nothing, seed=2, decay=True, claimed=1.06)
+def test_the_log_of_a_diagnosis_tells_a_colleague_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "c").mkdir()
+    for name in CASE_FILES:
+        (tmp_path / "c" / name).write_bytes(good(name))
+    asked: list[Campaign] = []
+
+    def engine(campaign: Campaign, seed: int, say: Callable[[float, str], None]) -> Diagnosis:
+        asked.append(campaign)
+        say(0.5, "weighing forces")
+        return answer(effect="nothing")
+
+    monkeypatch.setattr(recorded_answer, "diagnose_campaign", engine)
     found = run_diagnosis(tmp_path / "c", tmp_path / "why", seed=7, hypotheses=write(tmp_path, COGGING))
     log = (tmp_path / "why" / "run.log").read_text(encoding="utf-8")
-    for word in ("seed 7", "numpy", "input run.npz: SHA-256", "input mine.toml: SHA-256", "[1/2] diagnose: begun", found.sentence,
+    for word in ("seed 7", "numpy", "input run.npz: SHA-256", "input mine.toml: SHA-256", "[1/2] diagnose: begun", "weighing forces",
+                 found.sentence,
                  "note: Beside the catalogue, cogging of mine.toml"):
         assert word in log, word
+    assert "cogging" in asked[0].classes
     assert "Beside the catalogue, cogging of mine.toml" in (tmp_path / "why" / "report.html").read_text(encoding="utf-8")
     (tmp_path / "c" / "nominal.npz").write_bytes(b"torn")
     with pytest.raises(InputError):

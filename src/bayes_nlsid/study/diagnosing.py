@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bayes_nlsid.mismatch.case import read_case
+from bayes_nlsid.mismatch.case import Case, read_case
 from bayes_nlsid.mismatch.catalogue import Row, with_rows
 from bayes_nlsid.mismatch.diagnose import diagnose
 from bayes_nlsid.mismatch.diagnosis import Diagnosis, write_diagnosis
@@ -93,8 +93,8 @@ def _diagnosed(path: Path, seed: int | None, own: Sequence[Row], told: Reporter)
         from bayes_nlsid.mismatch.case_campaign import campaign_from_case, needs_general
 
         if not needs_general(path):
-            case = read_case(path)
-            return diagnose(replace(case, classes=case.classes + names), seed or 0, lambda sentence: say(0.0, sentence))
+            case = _with_classes(read_case(path), names) if names else path
+            return diagnose(case, seed or 0, lambda sentence: say(0.0, sentence))
         campaign = campaign_from_case(path)
     else:
         from bayes_nlsid.study.campaigns import campaign_of
@@ -103,6 +103,11 @@ def _diagnosed(path: Path, seed: int | None, own: Sequence[Row], told: Reporter)
         seed = study.seed if seed is None else seed
         campaign = campaign_of(study)
     return diagnose_campaign(replace(campaign, classes=campaign.classes + names), seed or 0, say)
+
+
+def _with_classes(case: Case, names: tuple[str, ...]) -> Case:
+    """The case, whose vocabulary knows the user's own classes too."""
+    return replace(case, classes=case.classes + names)
 
 
 def lines(found: Diagnosis) -> str:
