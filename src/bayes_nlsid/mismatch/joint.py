@@ -62,6 +62,7 @@ class Joint:
         self.rows = np.array([bench.family.places[p] for p in self.places])
         self.ext = extension(h.kinds, len(bench.channels))
         self.unique = repeats(bench.evidence.spectra)
+        self.coarse = 2 if strong(bench.evidence) else 1    # steps per sample; what a strong law does to resonances asks for shorter ones
         self.root = np.sqrt(2 * bench.evidence.trust[:, None, None] * bench.evidence.weight)
         self.y0 = [packed(e, e) for e in self.forces]
         self.edges = np.concatenate([[0], np.cumsum([len(p) for p in self.y0])]).astype(int)
@@ -91,7 +92,8 @@ class Joint:
         fld = replace(self.h.fit.fields, modes=modes)
         fit = replace(self.h.fit, fields=fld, shape_errors=errors)
         h = paths_to_sensors(bench, fit, self.places, spectra.s, parts(spectra.s))
-        there = simulate(paths.coarse if coarse else paths, spectra, self.effects(y), self.unique, warm, most=most, march_only=search)
+        paths = replace(paths, marched=self.coarse) if coarse else paths
+        there = simulate(paths, spectra, self.effects(y), self.unique, warm, most=most, march_only=search)
         projected = np.stack([evidence.project(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)
         residual = (evidence.residual + np.einsum("lsj,rlj->rls", h, projected, optimize=True)) * self.root
         shadow = np.stack([evidence.shadow(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)[evidence.excited]

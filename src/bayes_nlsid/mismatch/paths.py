@@ -43,6 +43,7 @@ class LawAlong:
 
 FINER = 2  # samples of the simulation per sample of the recording
 MARCHED = 4  # steps of a march in the order of time per sample of the simulation
+RESONANT = 1.0  # rad per step, up to which a mode is excited at its own frequency
 QUICK = 2.0  # rad per step beyond which a mode is taken as a spring
 
 
@@ -121,6 +122,8 @@ class Bed:
         low = self.modes.omega * dt < QUICK
         high = self.rows[:, ~low] / self.modes.omega[~low]
         own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)
+        # a force that is linear within a step has less of each frequency than the force itself: near its own a mode would feel it
+        forced = forced * np.where(self.modes.omega[low] * dt < RESONANT, np.sinc(self.modes.omega[low] * dt / (2 * np.pi)) ** -2.0, 1.0)
         back = _steady(own, forced, np.exp(self.s * dt)) if self.periodic else np.zeros((2, 0, 0), dtype=complex)
         fading = np.maximum(self.modes.zeta[low] * self.modes.omega[low] * self.samples * self.dt, 1e-12)
         return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back, -np.expm1(-fading) / fading)

@@ -15,6 +15,7 @@ from bayes_nlsid.mismatch.effects import Effect, pack, weakened
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
 from bayes_nlsid.mismatch.polish import WEAKER, Bench, Hypothesis, begin, estimate_linear, everywhere
+from bayes_nlsid.mismatch.quasilinear import strong_starts
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -67,7 +68,10 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     hopeless = strong(bench.evidence) and top_force < 0.02 * (bench.evidence.chi2 - bench.evidence.values)
     short = [] if hopeless else _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
-    singles = _pursued(bench, [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short])
+    begun = [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short]
+    if short and strong(bench.evidence):
+        begun += strong_starts(bench, (fit, *others)[-1].theta)
+    singles = _pursued(bench, begun)
     # a law that explains more than any linear effect could makes those superfluous as first effects
     linear_too = top_linear > 0.15 * top_force and (not singles or 1.5 * top_linear > none - singles[0].cost)
     if linear_too:
@@ -311,10 +315,10 @@ def _finish_leaders(bench: Bench, singles: list[Hypothesis], none: float, finish
     return sorted(out, key=lambda z: z.cost)
 
 
-def _other_formulas(bench: Bench, singles: list[Hypothesis], none: float, say: Progress) -> list[Hypothesis]:
-    """The other laws of the leading classes, on the motion that the leaders bring about, where they leave more than chance.
+def _other_formulas(bench: Bench, singles: list[Hypothesis], none: float, say: Progress, most: int = 4) -> list[Hypothesis]:
+    """The other laws at the places of the leaders, of any class, on the motion that these bring about, where they leave more than chance.
 
-    The first search takes one law of each class by the motion without it, where formulas are hard to tell apart.
+    The first search takes one law of each class by the motion without it, where formulas, and sometimes classes, are hard to tell apart.
     """
     out: list[Hypothesis] = []
     for h in singles[:2]:
@@ -323,15 +327,15 @@ def _other_formulas(bench: Bench, singles: list[Hypothesis], none: float, say: P
         if len(h.effects) > 1 or e.law is None or left < 3 * np.sqrt(2 * bench.evidence.values) or (
                 h.cost - singles[0].cost > 0.1 * (none - singles[0].cost)):
             continue
-        say(f"trying other laws of {e.cls}")
+        say(f"trying other laws at {e.place}")
         paths, motions = everywhere(bench, h, [e.place])
         found, _, _ = scan_forces(bench.family, h.fit, bench.evidence, [e.place], None, paths, motions, every=True)
-        same = [c for c in found if c.effect.cls == e.cls]
-        for c in same:
-            if c.effect.law is not e.law and c.gain > 0.5 * same[0].gain:
-                tried = begin(bench, h.fit, (c,))
-                if not _beaten(bench, tried, [h], 4.0):
-                    out.append(refine(bench, tried, steps=6, quick=True))
+        others = [c for c in found if c.effect.law is not None and c.effect.law is not e.law and c.gain > 0.5 * found[0].gain]
+        own = [c for c in others if c.effect.cls == e.cls]
+        for c in [*own[:most], *[c for c in others if c.effect.cls != e.cls][:most - len(own[:most])]]:
+            tried = begin(bench, h.fit, (c,))
+            if not _beaten(bench, tried, [h], 4.0):
+                out.append(refine(bench, tried, steps=6, quick=True))
     return _better(singles, out)
 
 

@@ -1,0 +1,203 @@
+"""Strong laws seen from afar: one place whose stiffness and damping differ from level to level.
+
+A law that changes the response by a tenth or more moves its place otherwise than any linear model without it, and bends the mean transfer
+function on which that model is calibrated; a search that begins there may never reach it. But to the force of each level the structure
+answers nearly as a linear one would, with another dynamic stiffness k + c s at the place of the law (equivalent linearization, Caughey
+1963). Such a fit, all levels with one linear model, has no side valleys worth the name. The place that needs least of it is that of the
+law; how k and c go with the level tells which law, and how strong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_nlsid.mismatch.calibrate import Extension, LinearFit, assemble, finish, floored
+from bayes_nlsid.mismatch.catalogue import CATALOGUE
+from bayes_nlsid.mismatch.effects import Effect, along_period
+from bayes_nlsid.mismatch.evidence import Evidence
+from bayes_nlsid.mismatch.explain import Candidate
+from bayes_nlsid.mismatch.laws import Law, Size
+from bayes_nlsid.mismatch.linear import Attachment
+from bayes_nlsid.mismatch.paths import Bed, bed
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin
+from bayes_nlsid.mismatch.valley import Place, follow
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+TOLERANCE = 0.1   # of a transfer function that is only nearly linear, relative
+SAME = 0.02       # difference of levels (log) that are taken as one
+WIDE = 30.0       # prior sd of an equivalent stiffness over the static one of the place, and of damping at mid band
+EVERY = 3         # lines of which one is used
+INEXACT = 0.05    # of an equivalent stiffness as the statement of a law, over the largest
+ALIKE = 6.0       # squared deviation over what is expected, up to which a law is worth a start
+PLACES = 2        # that are followed
+
+
+@final
+@dataclass(frozen=True)
+class Equivalent:
+    """One place with a dynamic stiffness of its own at every level, fitted together with the linear model.
+
+    Parameters
+    ----------
+    place : str
+    theta : ndarray (P,)
+        Linear model.
+    groups : tuple of ndarray of int
+        Records of each of Q levels.
+    values : ndarray (Q, 2)
+        Stiffness, N/m, and damping, N s/m.
+    covariance : ndarray (2 Q, 2 Q)
+        Of ``values``.
+    cost : float
+        −2 log posterior up to a constant.
+    """
+
+    place: str
+    theta: Array
+    groups: tuple[NDArray[np.intp], ...]
+    values: Array
+    covariance: Array
+    cost: float
+
+
+def by_level(evidence: Evidence) -> list[tuple[NDArray[np.intp], Complex, Array]]:
+    """Records, transfer function (Le, S) and its variance for each level."""
+    spectra, e = evidence.spectra, evidence.excited
+    mark = np.round(np.log(spectra.levels / spectra.levels.max()) / SAME)
+    out = []
+    for level in np.unique(mark):
+        records = np.flatnonzero(mark == level)
+        F, Y, trust = spectra.force[records][:, e], spectra.response[records][:, e], evidence.trust[records]
+        power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)
+        H = np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power[:, None]
+        out.append((records, H, spectra.noise[records][:, e].mean(0) / power[:, None] + (TOLERANCE * np.abs(H)) ** 2))
+    return out
+
+
+def equivalent(bench: Bench, place: str, theta: Array, levels: list[tuple[NDArray[np.intp], Complex, Array]], steps: int = 15) -> Equivalent:
+    """Fit of all levels with one linear model, begun at ``theta`` (P,), and a dynamic stiffness of each at ``place``."""
+    fam, count = bench.family, bench.family.size
+    s = bench.evidence.spectra.s[bench.evidence.excited][::EVERY]
+    unit = bench.stiffness[place] * np.array([1.0, 1.0 / float(np.abs(s).mean())])
+    beside = Extension(np.zeros(2), lambda x, q: ((Attachment(fam.places[place], unit[0] * x[0] + unit[1] * x[1] * q),), None),
+                       np.full(2, WIDE), np.zeros(2))
+    prior = np.concatenate([1 / fam.prior_sd ** 2, np.full(2 * len(levels), 1 / WIDE ** 2)])
+
+    def at(y: Array, derivatives: bool = True) -> Place:
+        normal, gradient, cost = np.diag(prior), -prior * y, float(prior @ y ** 2)
+        for i, (_, H, variance) in enumerate(levels):
+            own = count + 2 * i + np.arange(2)
+            system = assemble(fam, y[:count], y[own], s, H[::EVERY], variance[::EVERY], beside, derivatives=derivatives)
+            cost += system.chi2
+            if derivatives:
+                where = np.concatenate([np.arange(count), own])
+                normal[np.ix_(where, where)] += system.normal
+                gradient[where] += system.gradient
+        return Place(y, normal, gradient, cost)
+
+    end = follow(at, np.concatenate([theta, np.zeros(2 * len(levels))]), steps, 0.3)
+    units = np.tile(unit, len(levels))
+    covariance = np.linalg.inv(end.normal)[count:, count:] * np.outer(units, units)
+    return Equivalent(place, end.y[:count], tuple(records for records, _, _ in levels), (end.y[count:] * units).reshape(-1, 2),
+                      covariance, end.cost)
+
+
+def strong_starts(bench: Bench, theta: Array) -> list[Hypothesis]:
+    """Laws whose equivalents are those found at the likeliest places, as hypotheses to be estimated; none where there is one level only.
+
+    Parameters
+    ----------
+    theta : (P,) linear model to begin from.
+    """
+    levels = by_level(bench.evidence)
+    if len(levels) < 2:
+        return []
+    found = sorted((equivalent(bench, place, theta, levels) for place in bench.family.places), key=lambda e: e.cost)
+    values = 2 * sum(H[::EVERY].size for _, H, _ in levels)
+    out = []
+    for e in found[:PLACES]:
+        if e.cost - found[0].cost < 0.1 * values:
+            out += _laws_at(bench, e)
+    return out
+
+
+def _laws_at(bench: Bench, found: Equivalent) -> list[Hypothesis]:
+    """The best law of each class that goes with the level as the place does, begun."""
+    fam, evidence, spectra = bench.family, bench.evidence, bench.evidence.spectra
+    paths = bed(_linear(bench, found.theta).fields.modes, spectra, fam.places[found.place][None], fam.shaker)
+    moved = [_motion(paths, int(records[0]), k + c * paths.s) for records, (k, c) in zip(found.groups, found.values, strict=True)]
+    size = _largest(moved)
+    best: list[tuple[float, Candidate, float]] = []
+    for row in CATALOGUE:
+        if row.kind == "force":
+            each = [_matched(law, law.shapes(size), moved, paths, found, row.name) for law in row.laws]
+            best.append(min(each, key=lambda m: m[0]))
+    least = min(m[0] for m in best)
+    out = []
+    for misfit, candidate, offset in sorted(best, key=lambda m: m[0]):
+        if misfit < ALIKE * max(least, 1.0):
+            start = _linear(bench, _stiffened(bench, found, offset))
+            out.append(begin(bench, start, (candidate,), steps=0, weaker=0))
+    return out
+
+
+def _linear(bench: Bench, theta: Array) -> LinearFit:
+    """The linear model at ``theta``, held against a mean transfer function that a strong law has bent."""
+    evidence = bench.evidence
+    variance = floored(evidence.H, evidence.doubted(evidence.residual))
+    return finish(bench.family, theta, evidence.spectra.s[evidence.excited], evidence.H, variance, rounds=0)
+
+
+def _motion(paths: Bed, record: int, stiffness: Complex) -> tuple[Array, Array]:
+    """Displacement and velocity (n,) of the only place with this dynamic stiffness (K,) there."""
+    d, v = paths.in_time(paths.linear(record) / (1 + paths.among[:, 0] * stiffness[:, None]))
+    return d[:, 0], v[:, 0]
+
+
+def _largest(moved: list[tuple[Array, Array]]) -> Size:
+    d, v = max(moved, key=lambda m: float(np.std(m[0])))
+    return Size(max(float(np.std(d)), 1e-30), max(float(np.std(v)), 1e-30), max(float(np.abs(d).max()), 1e-30))
+
+
+def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: Bed, found: Equivalent, cls: str
+             ) -> tuple[float, Candidate, float]:
+    """The shape and factor of a law whose equivalents are nearest to those found: mean squared deviation, the law, and the stiffness that
+    belongs to the linear model beside it."""
+    along = [along_period(law, shapes, d, v, paths.dt, paths.periodic) for d, v in moved]                         # (K, n) each
+    own = np.array([[g @ d / (d @ d), g @ v / (v @ v)] for g, (d, v) in zip(along, moved, strict=True)])          # (Q, 2, K)
+    rate = float(np.mean([np.std(v) / np.std(d) for d, v in moved]))
+    scale = np.tile([1.0, rate], len(moved))                                             # damping as stiffness
+    wanted = found.values.ravel() * scale
+    doubt = found.covariance * np.outer(scale, scale) + np.diag(np.full(len(wanted), (INEXACT * np.abs(wanted).max()) ** 2 + 1e-300))
+    root = np.linalg.inv(np.linalg.cholesky(doubt))
+    offset, target = root @ np.tile([1.0, 0.0], len(moved)), root @ wanted
+    columns = root @ (own.reshape(len(wanted), -1) * scale[:, None])                                              # (2 Q, K)
+    free = np.eye(len(target)) - np.outer(offset, offset) / (offset @ offset)
+    columns_left, target_left = free @ columns, free @ target
+    factor = target_left @ columns_left / np.maximum((columns_left ** 2).sum(0), 1e-300)
+    if not law.signed:
+        factor = np.maximum(factor, 0.0)
+    misfit = ((target_left[:, None] - columns_left * factor) ** 2).sum(0) / max(len(target) - 2, 1)
+    k = int(np.argmin(misfit))
+    values = shapes[k].copy()
+    values[list(law.scaled)] *= factor[k]
+    params = law.term.params
+    effect = Effect(cls, found.place, law, values, tuple(p.name for p in params), tuple(p.unit for p in params))
+    return float(misfit[k]), Candidate(effect, 0.0), float(offset @ (target - columns[:, k] * factor[k]) / (offset @ offset))
+
+
+def _stiffened(bench: Bench, found: Equivalent, offset: float) -> Array:
+    """The linear model with the stiffness at the place that is no part of the law."""
+    fam, theta = bench.family, found.theta.copy()
+    if found.place in fam.names:
+        i = fam.names.index(found.place)
+        b, direction = fam.single.get(i), fam.places[found.place]
+        if b is not None:
+            own = float(b @ b) / float(direction @ direction)
+            theta[i] = float(np.log(max(np.exp(theta[i]) + offset / own, 0.05)))
+    return theta
