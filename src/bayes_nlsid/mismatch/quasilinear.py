@@ -28,6 +28,7 @@ from bayes_nlsid.mismatch.valley import Place, follow
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Level = tuple[NDArray[np.intp], Complex, Array]
 TOLERANCE = 0.1   # of a transfer function that is only nearly linear, relative
 SAME = 0.02       # difference of levels (log) that are taken as one
 WIDE = 30.0       # prior sd of an equivalent stiffness over the static one of the place, and of damping at mid band
@@ -65,7 +66,7 @@ class Equivalent:
     cost: float
 
 
-def by_level(evidence: Evidence) -> list[tuple[NDArray[np.intp], Complex, Array]]:
+def by_level(evidence: Evidence) -> list[Level]:
     """Records, transfer function (Le, S) and its variance for each level."""
     spectra, e = evidence.spectra, evidence.excited
     mark = np.round(np.log(spectra.levels / spectra.levels.max()) / SAME)
@@ -79,7 +80,7 @@ def by_level(evidence: Evidence) -> list[tuple[NDArray[np.intp], Complex, Array]
     return out
 
 
-def equivalent(bench: Bench, place: str, theta: Array, levels: list[tuple[NDArray[np.intp], Complex, Array]], steps: int = 15) -> Equivalent:
+def equivalent(bench: Bench, place: str, theta: Array, levels: list[Level], steps: int = 15) -> Equivalent:
     """Fit of all levels with one linear model, begun at ``theta`` (P,), and a dynamic stiffness of each at ``place``."""
     fam, count = bench.family, bench.family.size
     s = bench.evidence.spectra.s[bench.evidence.excited][::EVERY]
@@ -128,7 +129,7 @@ def strong_starts(bench: Bench, theta: Array) -> list[Hypothesis]:
 
 def _laws_at(bench: Bench, found: Equivalent) -> list[Hypothesis]:
     """The best law of each class that goes with the level as the place does, begun."""
-    fam, evidence, spectra = bench.family, bench.evidence, bench.evidence.spectra
+    fam, spectra = bench.family, bench.evidence.spectra
     paths = bed(_linear(bench, found.theta).fields.modes, spectra, fam.places[found.place][None], fam.shaker)
     moved = [_motion(paths, int(records[0]), k + c * paths.s) for records, (k, c) in zip(found.groups, found.values, strict=True)]
     size = _largest(moved)
