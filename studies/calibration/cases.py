@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from studies.calibration import truth
+from studies.calibration.five_joints import FiveJoints
 
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.fit import Fit, fit
@@ -30,6 +31,20 @@ class Case:
     law: type[truth.Static] | type[truth.Sliders]
     elements: tuple[Element, ...]
     stated: tuple[tuple[str, float, float], ...]     # kind, a, b of the priors of the joint's parameters
+    amplitudes: Array = field(default_factory=lambda: AMPLITUDES, repr=False)
+
+    def measure(self, scenario_: truth.Scenario, theta: Array, rng: np.random.Generator) -> Array:
+        """Channels (R, n, s) of virtual tests."""
+        return truth.measure(scenario_, theta, rng, self.law)
+
+    def shares(self, scenario_: truth.Scenario) -> Array:
+        """Noise of each channel over the rms of its signal."""
+        return np.asarray(scenario_.noise)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of theta."""
+        return Model(oscillator(frequency=truth.F0, zeta=truth.ZETA, location="M"), self.elements, (0,)).names
 
     def recording(self, scenario_: truth.Scenario, channels: Array) -> Recording:
         """One virtual test (n, s) as a recording."""
@@ -58,20 +73,9 @@ class Case:
 
     def backbone(self, theta: Array) -> tuple[Array, Array]:
         """Frequency (Hz) and damping ratio (..., 5) at ``AMPLITUDES`` by first harmonics, in closed form."""
-        f, zeta, a = theta[..., 0:1], theta[..., 1:2], AMPLITUDES
-        omega = 2 * np.pi * f
-        if self.law is truth.Static:
-            square = omega**2 + theta[..., 2:3] * a * 8 / (3 * np.pi)
-            lost = theta[..., 3:4] * 8 / (3 * np.pi) * square * a**2          # times pi a: energy per cycle
-            loss = np.pi * a * lost
-        else:
-            slip, chi = theta[..., 2:3], theta[..., 3:4]
-            share = truth.SHARE + (chi + 1) / (chi + 2)
-            largest = slip * (1 + truth.SHARE) / (truth.STICK * share)
-            density = slip * (chi + 1) / (largest ** (chi + 2) * share)
-            # secant at the turning point, and Masing's loop
-            square = omega**2 - density * a ** (chi + 1) / ((chi + 1) * (chi + 2))
-            loss = 4 * density * a ** (chi + 3) / ((chi + 2) * (chi + 3))
+        omega, zeta, a = 2 * np.pi * theta[..., 0:1], theta[..., 1:2], self.amplitudes
+        square = omega**2 + self.law.secant(theta, a)
+        loss = self.law.lost(theta, a, square)
         return np.sqrt(square) / (2 * np.pi), zeta * omega / np.sqrt(square) + loss / (2 * np.pi * square * a**2)
 
 
@@ -79,8 +83,11 @@ def _element(name: str, **fixed: float) -> Element:
     return Element(LIBRARY[name], ("M",), fixed=tuple(fixed.items()))
 
 
-CASES = {
+CASES: dict[str, Case | FiveJoints] = {
     "static": Case("static", truth.Static, (_element("q|q|"), _element("v|v|")), (("normal", -2.4e6, 4e5), ("normal", 4.0, 1.0))),
     "memory": Case("memory", truth.Sliders, (_element("iwan4_memory", k_t=truth.STICK, beta=truth.SHARE),),
                    (("lognormal", 13.0, 0.15), ("normal", -0.5, 0.08))),
+    **{name: FiveJoints(name, law, scheme) for name, law, scheme in (
+        ("five S2", truth.Static, "S2"), ("five S3", truth.Static, "S3"),
+        ("five S2 memory", truth.Sliders, "S2"), ("five S3 memory", truth.Sliders, "S3"))},
 }

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 from studies.calibration import truth
 from studies.calibration.cases import AMPLITUDES, CASES, Case
+from studies.calibration.five_joints import FiveJoints
 
 from bayes_nlsid.identification.fit import Fit
 from bayes_nlsid.inference.forward import ForwardLikelihood, forward_likelihood
@@ -27,7 +28,7 @@ FOLDER = Path(__file__).parent / "results"
 Array = np.ndarray
 
 
-def one_test(case: Case, scenario: truth.Scenario, theta: Array, channels: Array, seed: int) -> dict[str, Any]:
+def one_test(case: Case | FiveJoints, scenario: truth.Scenario, theta: Array, channels: Array, seed: int) -> dict[str, Any]:
     """Posterior of one virtual test: ranks, quantiles, spreads, backbone coverage."""
     began = time.process_time()
     recording = case.recording(scenario, channels)
@@ -44,22 +45,23 @@ def one_test(case: Case, scenario: truth.Scenario, theta: Array, channels: Array
     bands = [np.quantile(x, [0.05, 0.95], axis=0) for x in case.backbone(draws)]
     true = case.backbone(theta[None])
     return {"truth": theta, "rank": (ranked < theta).sum(axis=0), "quantiles": weighted.quantiles([0.025, 0.05, 0.25, 0.75, 0.95, 0.975]),
-            "sd": draws.std(axis=0), "mean": draws.mean(axis=0), "known": _known(likelihood, scenario, channels, priors),
+            "sd": draws.std(axis=0), "mean": draws.mean(axis=0), "known": _known(case, likelihood, scenario, channels, priors),
             "frequency_inside": (bands[0][0] <= true[0][0]) & (true[0][0] <= bands[0][1]),
             "damping_inside": (bands[1][0] <= true[1][0]) & (true[1][0] <= bands[1][1]),
             "regression": _regression(found, theta, priors), "shape": weighted.shape, "chained": chained,
             "seconds": time.process_time() - began}
 
 
-def _known(likelihood: ForwardLikelihood, scenario: truth.Scenario, channels: Array, priors: Any) -> Array:
+def _known(case: Case | FiveJoints, likelihood: ForwardLikelihood, scenario: truth.Scenario, channels: Array, priors: Any) -> Array:
     """Standard deviations that a posterior would have that knows the sensor noise exactly and has no nuisance but the initial state."""
     run = likelihood.error.runs[0]
     at = likelihood.expansion
-    clean = np.sqrt(np.mean(channels**2, axis=0) / (1 + np.square(scenario.noise)))
+    noise = case.shares(scenario)
+    clean = np.sqrt(np.mean(channels**2, axis=0) / (1 + noise**2))
     shape = np.ones(run.spectrum.bins)
     if scenario.coloured:
         shape = 80.0 / np.maximum(run.spectrum.frequency, 5.0)
-    variance = np.tile((shape[:, None] * (np.asarray(scenario.noise) * clean / run.scale) ** 2), (2, 1)).ravel()
+    variance = np.tile((shape[:, None] * (noise * clean / run.scale) ** 2), (2, 1)).ravel()
     slope = at.slope / np.sqrt(variance)[:, None]
     spread = np.array([likelihood.coordinates.to_s(p.quantile((np.arange(256) + 0.5) / 256)[:, None].repeat(len(priors), 1))[:, i].std()
                        for i, p in enumerate(priors)])
@@ -86,17 +88,17 @@ def run(case: str, scenario: str, count: int, seed: int, tell: Callable[[str], N
     chosen, noise = CASES[case], truth.SCENARIOS[scenario]
     first, second, third = np.random.SeedSequence([seed, *f"{case}/{scenario}".encode()]).spawn(3)
     theta = chosen.draw(count, np.random.default_rng(first))
-    channels = truth.measure(noise, theta, np.random.default_rng(second), chosen.law)
+    channels = chosen.measure(noise, theta, np.random.default_rng(second))
     tests = []
     for i, child in enumerate(third.spawn(count)):
         tests.append(one_test(chosen, noise, theta[i], channels[i], int(child.generate_state(1)[0])))
         if tell is not None and (i + 1) % 10 == 0:
             tell(f"{case}, {scenario}: {i + 1} of {count}")
-    names = chosen.regression(chosen.recording(noise, channels[0]), 0).problem.names
-    return {"case": case, "scenario": scenario, "count": count, "seed": seed, "versions": versions(), **summarise(names, tests)}
+    return {"case": case, "scenario": scenario, "count": count, "seed": seed, "versions": versions(),
+            **summarise(chosen.names, tests, chosen.amplitudes)}
 
 
-def summarise(names: tuple[str, ...], tests: list[dict[str, Any]]) -> dict[str, Any]:
+def summarise(names: tuple[str, ...], tests: list[dict[str, Any]], amplitudes: Array = AMPLITUDES) -> dict[str, Any]:
     """Coverage with standard errors, rank chi-squares, sharpness, backbone coverage."""
     n = len(tests)
     quantiles = np.array([t["quantiles"] for t in tests])        # (n, 6, P)
@@ -118,7 +120,7 @@ def summarise(names: tuple[str, ...], tests: list[dict[str, Any]]) -> dict[str, 
     out["ranks"] = ranks.T.tolist()
     out["length_over_known"] = [float(x) for x in np.median(sd / known, axis=0)]
     out["regression_length_over_forward"] = [float(x) for x in np.median(np.array([t["regression"]["sd"] for t in tests]) / sd, axis=0)]
-    out["backbone"] = {"amplitude_m": AMPLITUDES.tolist(), "frequency90": np.mean([t["frequency_inside"] for t in tests], axis=0).tolist(),
+    out["backbone"] = {"amplitude_m": amplitudes.tolist(), "frequency90": np.mean([t["frequency_inside"] for t in tests], axis=0).tolist(),
                        "damping90": np.mean([t["damping_inside"] for t in tests], axis=0).tolist()}
     out["chained"] = int(sum(t["chained"] for t in tests))
     out["refused"] = int(sum(t["shape"] > WORST_SHAPE for t in tests))
@@ -152,6 +154,6 @@ def line(result: dict[str, Any]) -> str:
 def keep(result: dict[str, Any], folder: Path = FOLDER) -> Path:
     """Store one result."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{result['case']}-{result['scenario'].replace(' ', '-')}.json"
+    path = folder / f"{result['case']}-{result['scenario']}.json".replace(" ", "-")
     path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return path

@@ -11,6 +11,7 @@ them, less their stiffness when all stick.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +67,16 @@ class Static:
     def commit(self, u: Array) -> None:
         """No memory."""
 
+    @staticmethod
+    def secant(parameters: Array, a: Array) -> Array:
+        """First harmonic of the force over the amplitude a of a sine, N/m."""
+        return parameters[..., 2:3] * a * 8 / (3 * np.pi)
+
+    @staticmethod
+    def lost(parameters: Array, a: Array, square: Array) -> Array:
+        """Energy lost per cycle, J; ``square`` is that of the circular frequency."""
+        return parameters[..., 3:4] * 8 / 3 * square * a**3
+
 
 class Sliders:
     """Springs in series with sliders, whose yield displacements φ have the density R φ^χ up to φ_max and a lump there (Segalman 2005).
@@ -97,6 +108,25 @@ class Sliders:
     def commit(self, u: Array) -> None:
         """The step has ended here."""
         self.now, self.last = self._forces(u), u
+
+    @staticmethod
+    def _density(parameters: Array) -> tuple[Array, Array]:
+        slip, chi = parameters[..., 2:3], parameters[..., 3:4]
+        share = SHARE + (chi + 1) / (chi + 2)
+        largest = slip * (1 + SHARE) / (STICK * share)
+        return slip * (chi + 1) / (largest ** (chi + 2) * share), chi
+
+    @staticmethod
+    def secant(parameters: Array, a: Array) -> Array:
+        """At the turning point, N/m, below the last yield."""
+        density, chi = Sliders._density(parameters)
+        return -density * a ** (chi + 1) / ((chi + 1) * (chi + 2))
+
+    @staticmethod
+    def lost(parameters: Array, a: Array, square: Array) -> Array:
+        """Area of Masing's loop, J; it does not depend on the frequency."""
+        density, chi = Sliders._density(parameters)
+        return 4 * density * a ** (chi + 3) / ((chi + 2) * (chi + 3))
 
 
 def integrate(frequency: Array, zeta: Array, law: Static | Sliders, disturbance: Array | None) -> tuple[Array, Array]:
@@ -130,12 +160,11 @@ def integrate(frequency: Array, zeta: Array, law: Static | Sliders, disturbance:
     return out[0], out[1]
 
 
-def hidden_mode(rng: np.random.Generator, count: int) -> Array:
+def hidden_mode(rng: np.random.Generator, count: int, n: int, push: Callable[[Array], Array]) -> Array:
     """Acceleration (count, n) of a mode at 151 Hz that the model does not have, shaken by the same force and a little noise."""
-    n = round(FS * SECONDS)
     frequency, zeta = 151.0 + rng.normal(size=(count, 1)), 0.003
     f = np.fft.rfftfreq(4 * n, 1 / FS)
-    drive = np.concatenate([np.tile(force(np.arange(n) / FS), (count, 1)) + 0.02 * rng.normal(size=(count, n)),
+    drive = np.concatenate([np.tile(push(np.arange(n) / FS), (count, 1)) + 0.02 * rng.normal(size=(count, n)),
                             np.zeros((count, 3 * n))], 1)
     gain = -(f**2) / (frequency**2 - f**2 + 2j * zeta * frequency * f)
     return np.fft.irfft(np.fft.rfft(drive, axis=1) * gain, 4 * n, axis=1)[:, :n]
@@ -161,7 +190,7 @@ def measure(scenario: Scenario, parameters: Array, rng: np.random.Generator,
         disturbance = rng.normal(scale=np.sqrt(scenario.process * FS * FINE / 2), size=(count, n * FINE))
     u, a = integrate(parameters[:, 0], parameters[:, 1], law(parameters), disturbance)
     if scenario.hidden_mode:
-        a = a + hidden_mode(rng, count)
+        a = a + hidden_mode(rng, count, n, force)
     out = []
     for quantity, share in zip(scenario.channels, scenario.noise, strict=True):
         clean = u if quantity == "displacement" else a

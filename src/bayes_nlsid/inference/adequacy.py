@@ -3,6 +3,10 @@
 Innovation: the error against sensor noise as measured, chi-square. Meter: the force that the model must call unmeasured, against sensor
 noise as a force. Library: whether the error points along the response to any of a few forces that the model does not have (score test
 with the parameters profiled out). A model that fails gives intervals that are conditional on being wrong.
+
+Passing is no proof: a force that resembles what the parameters do anyway can move them by many standard deviations before it shows
+in the error. How far is worked out for each library force (``Unseen``): intervals that allow for one such force are so many times
+longer. They answer "what if the form is not quite right", the others "given the form".
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 from bayes_nlsid.identification.output_error import start_state
 from bayes_nlsid.inference.covariance import Levels, Noise
 from bayes_nlsid.inference.forward import ForwardLikelihood
+from bayes_nlsid.inference.prior import Prior
 from bayes_nlsid.inference.unmeasured import NUDGE, POWER, forced_modes
 from bayes_nlsid.model import Model
 from bayes_nlsid.recordings.noise import NoiseFloor
@@ -33,6 +38,25 @@ FORCES = {
     "quadratic stiffness, odd": lambda q, v: q * np.abs(q), "quintic stiffness": lambda q, v: q**5,
     "quadratic stiffness, even": lambda q, v: q**2, "micro-slip": lambda q, v: np.sign(v) * np.sqrt(np.abs(v)),
 }
+
+
+@final
+@dataclass(frozen=True)
+class Unseen:
+    """What a force that the tests would not see does to a parameter.
+
+    Parameters
+    ----------
+    parameter : str
+    widening : float
+        Standard deviation when one library force of unknown strength is allowed, over that given the form; limited by the prior.
+    force : str
+        The one that widens most.
+    """
+
+    parameter: str
+    widening: float
+    force: str
 
 
 @final
@@ -55,6 +79,8 @@ class Adequacy:
         Library forces with their scores, largest first.
     notes : tuple of str
         What else was seen, such as lines left out.
+    unseen : tuple of Unseen
+        One for each parameter; empty without the score test.
     """
 
     misfit: bool
@@ -64,15 +90,18 @@ class Adequacy:
     meter: float
     scores: tuple[tuple[str, float], ...] = field(repr=False)
     notes: tuple[str, ...] = ()
+    unseen: tuple[Unseen, ...] = field(default=(), repr=False)
 
     def record(self) -> dict[str, Any]:
         """For ``result.json``."""
         return {"found": self.misfit, "reasons": list(self.reasons), "innovation": self.innovation,
                 "innovation_limit": self.innovation_limit, "log_unmeasured_force": self.meter,
-                "scores": [{"force": n, "z": z} for n, z in self.scores[:8]], "notes": list(self.notes)}
+                "scores": [{"force": n, "z": z} for n, z in self.scores[:8]], "notes": list(self.notes),
+                "unseen": [{"parameter": x.parameter, "widening": x.widening, "force": x.force} for x in self.unseen]}
 
 
-def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] = (), *, library: bool = True) -> Adequacy:
+def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] = (), *, library: bool = True,
+             priors: Sequence[Prior] = ()) -> Adequacy:
     """Test a fitted likelihood.
 
     Parameters
@@ -82,6 +111,8 @@ def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] 
         As given to ``forward_likelihood``; only measured ones are a standard.
     library : bool
         Whether to make the score test, nine simulations for each joint and recording.
+    priors : sequence of Prior
+        Limit what an unseen force can do; flat where none are given.
     """
     reasons = []
     ratio, limit = _innovation(likelihood, floors)
@@ -92,12 +123,14 @@ def adequacy(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None] 
     if meter > METER:
         reasons.append(f"the model must call unmeasured a force {np.exp(0.5 * meter):.2g} times as strong as sensor noise would feign: "
                        f"physics left out, or a real disturbance")
-    scores = _scores(likelihood) if library else ()
+    columns = _whitened(likelihood) if library else {}
+    scores = _scores(likelihood, columns) if library else ()
     if scores and abs(scores[0][1]) > SCORE:
         rivals = [name for name, z in scores[1:] if abs(z) > 0.6 * abs(scores[0][1])]
         reasons.append(f"the error points along {scores[0][0]} (score {scores[0][1]:+.1f})"
                        + (f"; nearly as well along {', '.join(rivals[:3])}" if rivals else ""))
-    return Adequacy(bool(reasons), tuple(reasons), ratio, limit, meter, scores, likelihood.dropped)
+    unseen = _unseen(likelihood, columns, dict(scores), priors) if library else ()
+    return Adequacy(bool(reasons), tuple(reasons), ratio, limit, meter, scores, likelihood.dropped, unseen)
 
 
 def _innovation(likelihood: ForwardLikelihood, floors: Sequence[NoiseFloor | None]) -> tuple[float | None, float | None]:
@@ -135,9 +168,9 @@ def _meter(likelihood: ForwardLikelihood) -> float:
     return float(max(out))
 
 
-def _scores(likelihood: ForwardLikelihood) -> tuple[tuple[str, float], ...]:
-    """Score of every library force at every joint, parameters and initial state profiled out; periodic recordings are left out."""
-    error, noise, at = likelihood.error, likelihood.noise, likelihood.expansion
+def _whitened(likelihood: ForwardLikelihood) -> dict[str, Array]:
+    """Whitened response (N,) to every library force at every joint; periodic recordings are left out."""
+    error, at = likelihood.error, likelihood.expansion
     joints = tuple(dict.fromkeys(place for e in error.problem.model.elements for place in e.locations)) or error.problem.model.linear.joints
     theta = likelihood.coordinates.to_theta(at.s)
     columns: dict[str, list[Array]] = {}
@@ -147,16 +180,50 @@ def _scores(likelihood: ForwardLikelihood) -> tuple[tuple[str, float], ...]:
         used += len(run.unknown)
         for name, column in _columns(likelihood, run, substeps, theta, mine, joints):
             columns.setdefault(name, []).append(column)
+    return {name: likelihood.noise.whiten(np.concatenate(parts)) for name, parts in columns.items()}
+
+
+def _scores(likelihood: ForwardLikelihood, columns: dict[str, Array]) -> tuple[tuple[str, float], ...]:
+    """Score of every library force at every joint, parameters and initial state profiled out."""
+    noise, at = likelihood.noise, likelihood.expansion
     z, slope = noise.whiten(at.error), noise.whiten(at.slope[:, :len(at.s)].T)
     basis = np.linalg.svd(slope.T / np.maximum(np.linalg.norm(slope, axis=1), 1e-300), full_matrices=False)[0]
     out = []
-    for name, parts in columns.items():
-        c = noise.whiten(np.concatenate(parts))
+    for name, c in columns.items():
         whole = float(np.linalg.norm(c))
         c = c - basis @ (basis.T @ c)
         if np.linalg.norm(c) > 1e-3 * whole and whole > 0:
             out.append((name, float(-c @ z / np.linalg.norm(c))))
     return tuple(sorted(out, key=lambda x: -abs(x[1])))
+
+
+def _unseen(likelihood: ForwardLikelihood, columns: dict[str, Array], scores: dict[str, float], priors: Sequence[Prior]
+            ) -> tuple[Unseen, ...]:
+    """For each parameter, the library force that widens it most: coefficient and parameters together, the coefficient flat."""
+    at, coordinates = likelihood.expansion, likelihood.coordinates
+    slope = likelihood.noise.whiten(at.slope[:, :len(at.s)].T)
+    spread = np.full(len(at.s), np.inf)
+    if priors:
+        shares = (np.arange(256) + 0.5) / 256
+        spread = coordinates.to_s(np.stack([p.quantile(shares) for p in priors], axis=-1)).std(axis=0)
+    scale = np.sqrt(np.maximum(np.sum(slope**2, axis=1) + spread**-2, 1e-300))
+    information = (slope @ slope.T + np.diag(spread**-2)) / np.outer(scale, scale)
+    covariance = np.linalg.pinv(information, 1e-12, hermitian=True) / np.outer(scale, scale)
+    own = np.maximum(np.diag(covariance), 1e-300)
+    widest, by = np.zeros(len(at.s)), [""] * len(at.s)
+    for name, z in scores.items():
+        c = columns[name]
+        along = covariance @ (slope @ c)
+        left = float(c @ c - (slope @ c) @ along)
+        if left <= 1e-6 * float(c @ c):
+            continue
+        # the coefficient is z ± 1 in units of its own standard deviation
+        extra = along**2 / left * (1 + z**2)
+        for i in np.flatnonzero(extra > widest):
+            widest[i], by[i] = extra[i], name
+    total = np.minimum(own + widest, np.maximum(spread**2, own))
+    return tuple(Unseen(name, float(np.sqrt(t / o)), force)
+                 for name, t, o, force in zip(likelihood.problem.names, total, own, by, strict=True))
 
 
 def _columns(likelihood: ForwardLikelihood, run: Any, substeps: int, theta: Array, states: Array, joints: tuple[str, ...]

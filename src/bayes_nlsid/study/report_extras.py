@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayes_nlsid.study import report_page as html
-from bayes_nlsid.study.axes import brief_names, digits_for, engineering
+from bayes_nlsid.study.axes import brief, brief_names, digits_for, engineering
 from bayes_nlsid.study.store import Saved
 
 
@@ -122,6 +122,17 @@ def comparison_rows(summary: Mapping[str, Any]) -> list[list[str]]:
             for r in summary["alternatives"]]
 
 
+def _unseen(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How far parameters hang on the form of the model."""
+    shown = [[name, f"{row['widening']:.2g}", brief(row["force"])]
+             for name, row in zip(brief_names([r["parameter"] for r in rows]), rows, strict=True) if row["widening"] > 1.05]
+    if not shown:
+        return ""
+    table = html.table(["parameter", "interval is so many times longer", "if this force were there, too weak to be seen"], shown,
+                       "stages/posterior", numeric=(1,))
+    return html.details("Intervals are given the form of the model: what a force that the tests cannot see would do", table)
+
+
 def stages_section(data: Mapping[str, Any], parameters: Sequence[Mapping[str, Any]]) -> str:
     """Regression and simulation beside each other, and the tests of the simulated recordings."""
     second = data.get("second_stage")
@@ -146,6 +157,7 @@ def stages_section(data: Mapping[str, Any], parameters: Sequence[Mapping[str, An
                  *([f"score of {s['force']} (limit 4)", f"{s['z']:+.2g}"] for s in misfit["scores"][:3])]
         out += html.table(["does the model explain the recordings?", "no" if misfit["found"] else "yes"], facts, "stages/posterior")
         out += html.listing([*misfit["reasons"], *misfit["notes"]])
+        out += _unseen(misfit.get("unseen", []))
     if "k_hat" in second:
         out += html.paragraph(f"{second['simulated']} draws were simulated and weighted; k-hat {second['k_hat']:.2f} (limit 0.7), "
                               f"{second['effective']:.0f} effective.", "soft")

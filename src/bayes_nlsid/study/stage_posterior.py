@@ -117,7 +117,7 @@ def _forward(context: Context, entry: PosteriorEntry, start: Fit, priors: tuple[
                                         progress=lambda share, sentence: context.progress(0.5 + 0.15 * share, sentence))
     except ValueError as error:
         return None, None, {"status": "failed", "reasons": [str(error)], "misfit": None}
-    tested = adequacy(likelihood, floors)
+    tested = adequacy(likelihood, floors, priors=priors)
     found, weighted = forward_posterior(start, likelihood, priors, ensembles=entry.ensembles, steps=entry.steps, walkers=entry.walkers,
                                         most=entry.most or MOST_STEPS, seed=context.number("posterior forward"), workers=context.workers,
                                         store=None if folder is None else folder / "forward",
