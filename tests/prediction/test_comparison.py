@@ -35,6 +35,20 @@ def test_differences_and_their_errors() -> None:
     assert [r["name"] for r in found.rows()][-1] == "b"
 
 
+def test_blocks_of_unequal_weight_that_all_agree_are_no_chance() -> None:
+    """One alternative loses everywhere, by ten here and thousands there: the standard error is as large as the difference."""
+    base = np.zeros(6)
+    found = made(np.stack([base, -np.array([12.0, 15.0, 20.0, 80.0, 9000.0, 30.0]), -np.array([12.0, -15.0, 20.0, -80.0, 9000.0, 30.0])]))
+    value, error = found.difference(1)
+    assert -value < 2 * error and found.chance(1) == pytest.approx(1 / 64) and found.told_apart(1)
+    assert not found.told_apart(2) and found.chance(2) > 0.05
+    five = made(np.stack([base[:5], -np.array([12.0, 15.0, 20.0, 80.0, 9000.0])]))
+    assert not five.told_apart(1)       # five signs agree by chance in one of 32 cases
+    rng = np.random.default_rng(1)
+    many = made(np.stack([np.zeros(40), rng.normal(size=40)]))
+    assert 0.05 < many.chance(1, 0) < 0.95
+
+
 def test_stacking_is_the_best_mixture() -> None:
     """Two alternatives, each right on half of the blocks: the mixture's log score is largest at the weights returned."""
     log = np.log(np.array([[0.9, 0.8, 0.9, 0.1, 0.2], [0.1, 0.2, 0.3, 0.7, 0.9]]))

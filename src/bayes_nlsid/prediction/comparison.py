@@ -18,13 +18,16 @@ from bayes_nlsid.model import Model
 from bayes_nlsid.prediction.heldout import Replayed, replayed
 from bayes_nlsid.recordings.noise import NoiseFloor
 from bayes_nlsid.recordings.recording import Recording
+from bayes_nlsid.simulation.integration import EVEN_BATCH, LONG_RUN
 
 Array = NDArray[np.float64]
 CYCLES, DECAYS = 10, 3          # of the slowest mode in the band: a block is as long as the longer of the two
 FEWEST, WANTED = 3, 8           # blocks of a record: needed, and wanted before decay times lengthen them
 SMOOTH = 2                      # bins to each side over which the predicted power is averaged
 SURE, ALMOST = 2.0, 4.0         # standard errors, and log units, below which alternatives are not told apart
+CHANCE, FLIPS = 0.0228, 4096    # one-sided probability of two standard errors; random signs where there are too many to try all
 ROUNDS = 2000
+SUBSTEPS = 4                     # of the integrator for a sample, as a rule: only to guess the work
 
 
 @final
@@ -110,10 +113,27 @@ class Comparison:
             return float("-inf"), float("nan")
         return float(each.sum()), float(np.sqrt(len(each)) * each.std(ddof=1))
 
+    def chance(self, k: int, reference: int | None = None) -> float:
+        """Probability of a difference as negative as this if each block were as likely to speak for the one as for the other.
+
+        Blocks differ in how much they hold: where one alternative loses in all of them, by a hundred here and by ten thousand there, the
+        scatter between blocks is as large as the difference, and yet nothing is in doubt. So signs of the blocks' differences are flipped.
+        """
+        each = self.by_block[k] - self.by_block[self.best if reference is None else reference]
+        if not np.isfinite(each).all():
+            return 0.0
+        count = len(each)
+        if 2**count <= FLIPS:
+            signs = 1 - 2 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
+        else:
+            signs = np.random.default_rng(0).choice([-1, 1], size=(FLIPS, count))
+            signs[0] = 1
+        return float(np.mean(signs @ each <= each.sum() + 1e-12 * np.abs(each).sum()))
+
     def told_apart(self, k: int) -> bool:
-        """Whether an alternative is worse than the best by more than chance."""
+        """Whether an alternative is worse than the best: by two standard errors, or by signs that agree as seldom by chance."""
         value, error = self.difference(k)
-        return value == -np.inf or (-value > ALMOST and -value > SURE * error)
+        return value == -np.inf or (-value > ALMOST and (-value > SURE * error or self.chance(k) < CHANCE))
 
     @property
     def stacking(self) -> Array:
@@ -194,16 +214,20 @@ def compare(alternatives: Sequence[Alternative], train: Sequence[tuple[Recording
     if not alternatives or not heldout:
         raise ValueError("a comparison needs at least one alternative and one record that was not fitted")
     linear = alternatives[0].model.linear
+    # the same records again and again: together they are long enough for the compiled loop, even if each is not
+    work = sum(r.n for r, _ in (*train, *heldout)) * sum(1 + len(a.theta) / EVEN_BATCH for a in alternatives)
+    compiled = True if SUBSTEPS * work > LONG_RUN else None
     cuts = [_cut(recording, linear.frequency, linear.zeta, band) for recording, _ in heldout]
     labels = tuple(f"{r.name}, {a * r.dt:.3g}-{b * r.dt:.3g} s" for (r, _), cut in zip(heldout, cuts, strict=True) for a, b in cut)
     densities, shares, errors = [], [], []
     for i, one in enumerate(alternatives):
         if progress is not None:
             progress(i / len(alternatives), f"predicting with {one.name}")
-        share = _learnt(one, train, band, tolerance, seed)
+        share = _learnt(one, train, band, tolerance, seed, compiled)
         parts, wrong, total = [], 0.0, 0.0
         for (recording, floor), cut in zip(heldout, cuts, strict=True):
-            found = replayed(one.model, one.theta, recording, band=band, noise=floor, tolerance=tolerance, seed=seed)
+            found = replayed(one.model, one.theta, recording, band=band, noise=floor, tolerance=tolerance, seed=seed,
+                             compiled=compiled)
             parts.append(_density(found, recording, floor, band, cut, share))
             ok = found.values[found.ok]
             middle = np.median(ok, axis=0) if len(ok) else np.full(recording.response.shape, np.nan)
@@ -282,14 +306,14 @@ def _density(found: Replayed, recording: Recording, floor: NoiseFloor, band: tup
 
 
 def _learnt(one: Alternative, train: Sequence[tuple[Recording, NoiseFloor]], band: tuple[float, float], tolerance: float | None,
-            seed: int) -> Array:
+            seed: int, compiled: bool | None) -> Array:
     """Discrepancy variance (s,) relative to the predicted power, the most likely one on the records that were fitted; one for all."""
     from scipy.optimize import minimize_scalar
 
     middle = np.median(one.theta, axis=0)[None]
     parts = []
     for recording, floor in train:
-        found = replayed(one.model, middle, recording, band=band, noise=floor, tolerance=tolerance, seed=seed)
+        found = replayed(one.model, middle, recording, band=band, noise=floor, tolerance=tolerance, seed=seed, compiled=compiled)
         if found.ok.any():
             cut = _cut(recording, one.model.linear.frequency, one.model.linear.zeta, band)
             parts += [(np.abs(m - s[0]) ** 2, n, p) for m, s, n, p in _pieces(found, recording, floor, band, cut)]
