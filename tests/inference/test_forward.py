@@ -9,6 +9,7 @@ import pytest
 from studies.calibration import truth
 from studies.calibration.cases import CASES
 
+from bayes_nlsid.inference import adequacy as judge
 from bayes_nlsid.inference.adequacy import Adequacy, adequacy
 from bayes_nlsid.inference.arviz_export import pareto_smoothed
 from bayes_nlsid.inference.covariance import Layout, Levels, Noise, restricted
@@ -180,9 +181,48 @@ class Coulomb(truth.Static):
         return super().force(u, v) + 0.03 * np.tanh(v / 0.02)
 
 
+class Stiffening(truth.Static):
+    """A cubic spring of 0.3 % of the linear force at 0.7 mm that the model does not have."""
+
+    def force(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """N."""
+        return super().force(u, v) + 1.5e9 * u**3
+
+
+def test_a_force_that_passes_for_unmeasured_force_is_seen_once_it_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The levels of noise make room for a coherent force, and its score stays at 4; taken out, they fall and the score does not."""
+    before: list[tuple[tuple[str, float], ...]] = []
+    real = judge._once_allowed
+    monkeypatch.setattr(judge, "_once_allowed", lambda a, b, scores: (before.append(scores), real(a, b, scores))[1])
+    found, _ = examined(Stiffening, 7)
+    assert abs(before[0][0][1]) < 5 and abs(found.scores[0][1]) > 8 and "cubic" in found.scores[0][0]
+    assert found.misfit and "points along" in found.reasons[-1]
+
+
+def test_what_an_unseen_force_would_do_is_that_of_one_more_coefficient(one: tuple[np.ndarray, ForwardLikelihood]) -> None:
+    """Against the covariance of parameters and coefficient together; the prior limits it."""
+    likelihood = one[1]
+    at = likelihood.expansion
+    column = at.slope[:, 2] / np.linalg.norm(at.slope[:, 2]) + 1e-3 * np.random.default_rng(0).normal(size=len(at.error))
+    found = judge._unseen(likelihood, {"like k2": column}, {"like k2": 0.0}, ())
+    slope = likelihood.noise.whiten(np.concatenate([at.slope[:, :4].T, column[None]]))
+    size = np.linalg.norm(slope, axis=1)
+    slope = slope / size[:, None]
+    together, given = np.linalg.inv(slope @ slope.T), np.linalg.inv(slope[:4] @ slope[:4].T)
+    assert [x.widening for x in found] == pytest.approx(np.sqrt(np.diag(together)[:4] / np.diag(given)), rel=1e-3)
+    assert found[2].widening == max(x.widening for x in found) > 1.2 and found[2].force == "like k2"
+    more = judge._unseen(likelihood, {"like k2": column}, {"like k2": 3.0}, ())
+    assert more[2].widening**2 - 1 == pytest.approx(10 * (found[2].widening**2 - 1), rel=1e-6)
+    priors = CASE.priors(likelihood.problem)
+    capped = judge._unseen(likelihood, {"like k2": column}, {"like k2": 1e6}, priors)
+    sd = np.sqrt(np.diag(np.linalg.inv(at.information))) * np.exp(likelihood.coordinates.log_jacobian(at.s))
+    assert capped[2].widening == pytest.approx(4e5 / sd[2], rel=0.35)      # the prior's standard deviation, in coordinates that bend
+
+
 def test_a_right_model_is_adequate_and_hidden_friction_is_seen() -> None:
     right, _ = examined(truth.Static, 3)
     assert not right.misfit, right.reasons
     assert right.innovation < right.innovation_limit
+    assert len(right.unseen) == 4 and all(x.widening >= 1 for x in right.unseen) and right.record()["unseen"][2]["force"]
     wrong, _ = examined(Coulomb, 4)
     assert wrong.misfit and wrong.record()["reasons"]

@@ -209,7 +209,7 @@ def _once_allowed(likelihood: ForwardLikelihood, columns: dict[str, Array], scor
     at, noise = likelihood.expansion, likelihood.noise
     again = dict(scores)
     for name, z in scores[:LOOKED_AT]:
-        if SUSPICIOUS < abs(z) < SCORE:
+        if abs(z) > SUSPICIOUS:
             design = np.concatenate([at.slope[:, :len(at.s)], columns[name][:, None]], axis=1)
             design = design / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
             share = np.linalg.lstsq(noise.whiten(design.T).T, noise.whiten(at.error), rcond=1e-10)[0]
