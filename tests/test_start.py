@@ -42,6 +42,18 @@ def test_every_dependency_is_locked_within_its_limits() -> None:
     for text in (*project["build-system"]["requires"], *project["project"]["optional-dependencies"]["dev"]):
         requirement = Requirement(text)
         assert requirement.specifier.contains(everything[requirement.name]), text
+    extras = pinned("lock-extras.txt")
+    assert not set(extras) & set(lock)
+    for text in (*project["project"]["optional-dependencies"]["tdms"], *project["project"]["optional-dependencies"]["nastran"]):
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(extras[requirement.name]), text
+
+
+def test_the_checks_cover_every_python_that_is_stated() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    stated = [c.rpartition(" ")[2] for c in project["classifiers"] if re.search(r":: 3\.\d+$", c)]
+    assert stated[0] == project["requires-python"].removeprefix(">=") and len(stated) > 2
+    assert f"for version in {' '.join(stated)}; do" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
 def test_old_python_gets_one_sentence(start: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

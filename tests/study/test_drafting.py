@@ -102,7 +102,8 @@ def test_matrices_of_a_program_ask_for_their_units(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("names", "words"), [
     (["none.csv"], "there is no such file"), (["nominal.npz"], "holds no recording"), (["a.wav"], "are not read"),
     (["nominal.npz", "nominal.npz", "decay.csv"], "both look like the mass"), (["k.mtx", "decay.csv"], "comes without a mass matrix"),
-    (["short.csv"], "no array of 16 samples"),
+    (["short.csv"], "no array of 16 samples"), (["decay.csv", "copy.csv"], "copy.csv: holds the same as decay.csv"),
+    (["decay.csv", "folder"], "is a folder"),
 ])
 def test_files_that_make_no_study(tmp_path: Path, names: list[str], words: str) -> None:
     nominal(tmp_path)
@@ -110,6 +111,8 @@ def test_files_that_make_no_study(tmp_path: Path, names: list[str], words: str) 
     table(tmp_path / "short.csv", "time [s],acc [g]", T[:5], RING[:5])
     (tmp_path / "k.mtx").write_text("1,1, 1,1, 20.\n")
     (tmp_path / "a.wav").write_bytes(b"RIFF")
+    (tmp_path / "copy.csv").write_bytes((tmp_path / "decay.csv").read_bytes())
+    (tmp_path / "folder").mkdir()
     with pytest.raises(InputError, match=words):
         draft_study(tmp_path / "new", [tmp_path / n for n in names])
     assert not (tmp_path / "new").exists()

@@ -14,10 +14,13 @@ import pytest
 
 from bayes_nlsid import cli
 from bayes_nlsid.study import report_page as html
+from bayes_nlsid.study.diagnosis_page import page
+from bayes_nlsid.study.diagnosis_pictures import pictures
 from bayes_nlsid.study.reading import read_study
 from bayes_nlsid.study.report_markdown import markdown
 from bayes_nlsid.study.run import run_study
 from tests.study.test_planning import write
+from tests.study.test_study_diagnosing import answer
 
 BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
 WIDTHS = (1280, 390)  # a desk and a phone
@@ -55,16 +58,27 @@ def pages(small: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory)
     shutil.copytree(finished / "stages", folder / "run" / "stages")  # a title changes the report alone
     run_study(read_study(small.with_name("long.toml")), folder / "run")
     assert cli.main(["plan", str(write(folder)), "--out", str(folder / "plan"), "--quiet"]) == 0
-    return {"run": folder / "run" / "report.html", "plan": folder / "plan" / "plan.html"}
+    return {"run": folder / "run" / "report.html", "plan": folder / "plan" / "plan.html", "diagnosis": diagnosis(folder / "diagnosis")}
+
+
+def diagnosis(folder: Path) -> Path:
+    """The page of a diagnosis with every figure that a force law has, and a file with a name as long as they come."""
+    found = answer(effect="law")
+    drawn = pictures(found, None)
+    (folder / "figures").mkdir(parents=True)
+    for name, (image, _) in drawn.items():
+        (folder / "figures" / f"{name}.png").write_bytes(image)
+    (folder / "report.html").write_text(page(found, drawn, [("a" * 200 + ".npz", "0123456789abcdef" * 4)]), encoding="utf-8")
+    return folder / "report.html"
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("name", ["run", "plan"])
+@pytest.mark.parametrize("name", ["run", "plan", "diagnosis"])
 def test_nothing_overflows_is_missing_or_is_fetched(name: str, pages: dict[str, Path], tmp_path: Path) -> None:
-    page = pages[name].read_text(encoding="utf-8")
-    for at in measured(page, tmp_path):
+    text = pages[name].read_text(encoding="utf-8")
+    for at in measured(text, tmp_path):
         assert at["scroll"] <= at["width"] and at["wide"] == [], at
-        assert len(at["images"]) == page.count("<img") > 1 and all(at["images"]), at
+        assert len(at["images"]) == text.count("<img") > 1 and all(at["images"]), at
         assert at["asked"] == []
 
 
@@ -93,16 +107,16 @@ def test_text_can_be_read_light_dark_and_on_paper(scheme: int) -> None:
 
 
 def test_a_page_forbids_its_browser_every_request(pages: dict[str, Path]) -> None:
-    for page in pages.values():
-        assert "Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\"" in page.read_text(
+    for path in pages.values():
+        assert "Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\"" in path.read_text(
             encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["run", "plan"])
+@pytest.mark.parametrize("name", ["run", "plan", "diagnosis"])
 def test_markdown_says_the_same(name: str, pages: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     folder = pages[name].parent
     assert cli.main(["report", str(folder), "--format", "markdown"]) == 0
-    written = folder / ("report.md" if name == "run" else "plan.md")
+    written = folder / ("plan.md" if name == "plan" else "report.md")
     assert str(written) in capsys.readouterr().out
     page, text = pages[name].read_text(encoding="utf-8"), written.read_text(encoding="utf-8")
     images = re.findall(r"!\[.*?\]\(<(.*?)>\)", text)

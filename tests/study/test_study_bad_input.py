@@ -107,6 +107,19 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
+def test_a_copy_does_not_judge_what_its_original_was_fitted_to(tmp_path: Path) -> None:
+    text = TEXT.replace("window = [8.0, 12.0]", "window = [7.0, 12.0]")
+    first, name, second = text.partition('name = "later part"')
+    assert name
+    path = write(tmp_path, first + name + '\nfile = "copy.npz"' + second)
+    (tmp_path / "copy.npz").write_bytes((tmp_path / "recording.npz").read_bytes())
+    with pytest.raises(InputError, match="'later part' is kept for judging, but 7 to 8 s of it is fitted in 'multisine'"):
+        read_study(path)
+    with (tmp_path / "copy.npz").open("ab") as file:
+        file.write(b"another")
+    read_study(path)
+
+
 def test_the_template_itself_is_good(tmp_path: Path) -> None:
     study = read_study(write(tmp_path, TEXT))
     assert study.stages == ("read", "linear", "identify", "posterior", "predict", "report")

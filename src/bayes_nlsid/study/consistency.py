@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from math import inf
+from pathlib import Path
 from typing import Any
 
 from bayes_nlsid.errors import InputError
@@ -14,6 +15,7 @@ from bayes_nlsid.structure.structure import Structure
 from bayes_nlsid.study.building import library
 from bayes_nlsid.study.reading_structure import GROUPS
 from bayes_nlsid.study.schema import Study
+from bayes_nlsid.study.store import file_digest
 from bayes_nlsid.study.table import nearest
 
 
@@ -124,7 +126,7 @@ def _check_roles(study: Study, where: str) -> None:
 
 
 def _check_windows(study: Study, where: str) -> None:
-    """What judges must not hold samples that are fitted: windows of the same signals of one file must not overlap."""
+    """What judges must not hold samples that are fitted: windows of the same signals of one file, or of its copy, must not overlap."""
     judges = study.prediction.heldout if study.prediction is not None else ()
     for number, kept in enumerate(study.recordings, start=1):
         if kept.role != "holdout" and kept.name not in judges:
@@ -132,7 +134,7 @@ def _check_windows(study: Study, where: str) -> None:
         signals = {(c.array, c.column) for c in kept.channels if c.quantity != "force"}
         for fitted in study.recordings:
             shared = signals & {(c.array, c.column) for c in fitted.channels if c.quantity != "force"}
-            if fitted.role != "train" or fitted is kept or fitted.file != kept.file or not shared:
+            if fitted.role != "train" or fitted is kept or not shared or not _same_file(fitted.file, kept.file):
                 continue
             low, high = (edge(a, b) for edge, a, b in zip((max, min), kept.window or (0.0, inf), fitted.window or (0.0, inf), strict=True))
             if low < high:
@@ -140,6 +142,12 @@ def _check_windows(study: Study, where: str) -> None:
                 raise InputError(f"{where}: [[recordings]] {number} window",
                                  f"{kept.name!r} is kept for judging, but {part} of it is fitted in {fitted.name!r}",
                                  "move one of the windows, so that nothing judges what it was fitted to")
+
+
+def _same_file(one: str, other: str) -> bool:
+    """Whether two paths lead to the same bytes."""
+    a, b = Path(one), Path(other)
+    return a == b or (a.stat().st_size == b.stat().st_size and file_digest(a) == file_digest(b))
 
 
 def _check_priors(study: Study, where: str) -> None:

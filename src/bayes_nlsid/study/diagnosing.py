@@ -33,10 +33,10 @@ def run_diagnosis(path: Path | str, out: Path | str, *, seed: int | None = None,
     """
     case, folder = Path(path), Path(out)
     own = () if hypotheses is None else read_hypotheses(hypotheses)
+    inputs = _inputs(case, hypotheses)
     figures = make_folder(folder, "figures")
     told = reporter if reporter is not None else Reporter((folder / "run.log",))
     with writing(folder), held(figures / "lock"), with_rows(own):
-        inputs = _inputs(case, hypotheses)
         opening(told, f"nlsid diagnose {case}, seed {'of the study, else 0' if seed is None else seed}", versions(), inputs)
         with ending(told, "begins anew"):
             return _carry_out(case, folder, seed, own, inputs, told)

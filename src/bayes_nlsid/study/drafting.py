@@ -69,10 +69,14 @@ def draft_study(folder: Path, files: Sequence[Path]) -> Path:
 def _find(files: Sequence[Path]) -> _Findings:
     structure: dict[str, Path] = {}
     modes, form, recordings = None, "", []
+    read: dict[str, Path] = {}
     for path in files:
         kind, contents = kind_of(path)
         if kind == "recording":
             assert contents is not None
+            if read.setdefault(contents.sha256, path) is not path:
+                raise InputError(str(path), f"holds the same as {read[contents.sha256].name}",
+                                 "name it once: nothing may judge what it was fitted to")
             recordings.append(survey_recording(path, contents))
         elif kind == "modes":
             modes = path

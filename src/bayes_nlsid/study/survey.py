@@ -75,6 +75,8 @@ def kind_of(path: Path) -> tuple[Kind, Contents | None]:
         If it cannot be read, or is nothing that a study is made of.
     """
     suffix, stem = path.suffix.lower(), path.stem.lower()
+    if path.is_dir():
+        raise InputError(str(path), "is a folder", "name the files in it")
     if not path.is_file():
         raise InputError(str(path), "there is no such file", "check the path")
     if suffix == ".toml":
