@@ -154,6 +154,7 @@ def test_oscillator_and_chain_are_the_same_structure() -> None:
 
 @pytest.mark.parametrize("M, K, word", [
     (np.eye(2), np.array([[1.0, 2.0], [0.0, 1.0]]), "not symmetric"), (np.diag([1.0, 0.0]), np.eye(2), "not positive definite"),
+    (1e-9 * np.eye(2), 1e308 * np.eye(2), "leaves the range of numbers"),
     (np.eye(2), np.diag([1.0, -0.1]), "negative eigenvalues"), (np.eye(2), np.diag([1.0, np.nan]), "NaN"), (np.eye(3), np.eye(2), "shape")])
 def test_bad_matrices_are_refused_in_words(M: np.ndarray, K: np.ndarray, word: str) -> None:
     with pytest.raises(ValueError, match=word):

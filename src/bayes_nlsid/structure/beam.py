@@ -19,6 +19,7 @@ _DIRECTIONS = ("u", "w", "rot")
 
 MOST_ELEMENTS = 1000
 """Along the length; matrices are full, so that more would take gigabytes."""
+HUGE = 1e30   # of a length, stiffness or density in SI, beyond which it is a slip; powers of it stay within the range of numbers
 
 
 @final
@@ -95,10 +96,12 @@ class LappedBeam:
         for name in ("length", "width", "height", "E", "rho", "element_size"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"lapped beam: {name} must be positive, got {getattr(self, name)}")
+            if not 1 / HUGE < getattr(self, name) < HUGE:
+                raise ValueError(f"lapped beam: {name} = {getattr(self, name):g} is of no beam; check its unit")
         if self.length > MOST_ELEMENTS * self.element_size:
             raise ValueError(f"lapped beam: elements of {self.element_size:g} m are {self.length / self.element_size:.3g} along it, "
                              f"at most {MOST_ELEMENTS} are possible")
-        if not -1 < self.nu < 0.5 or (self.G is not None and self.G <= 0) or (self.shear_factor is not None and self.shear_factor <= 0):
+        if not -1 < self.nu < 0.5 or any(x is not None and not 1 / HUGE < x < HUGE for x in (self.G, self.shear_factor)):
             raise ValueError("lapped beam: nu must lie in (-1, 0.5), G and shear_factor must be positive")
         places = [x for _, x in (*self.sensors, *self.inputs, *self.points)] + [x for x, _ in self.bolts] + [x for _, x, _ in self.masses]
         if any(not 0 <= x <= self.length for x in places):
@@ -137,7 +140,7 @@ class LappedBeam:
         if value is None:
             return None
         springs = (float(value),) * len(self.stations) if np.ndim(value) == 0 else tuple(float(v) for v in value)
-        if len(springs) != len(self.stations) or any(not np.isfinite(k) or k < 0 for k in springs):
+        if len(springs) != len(self.stations) or any(not 0 <= k < HUGE for k in springs):
             raise ValueError(f"lapped beam: {name} must be one non-negative stiffness or one for each of {len(self.stations)} stations")
         return springs
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 else:
     Matrix = Any
 
+LARGEST = 1e290    # (rad/s)², far from any structure and from the end of the range of numbers
 SYMMETRY = 1e-9
 """Largest relative difference between a matrix and its transpose that counts as rounding."""
 
@@ -80,6 +81,8 @@ class Structure:
                 raise ValueError(f"{role} name unknown locations {sorted(unknown)}; known are {sorted(self.locations)}")
         if not positive_definite(self.M):
             raise ValueError("M is not positive definite: every degree of freedom needs a mass; condense massless ones out first")
+        if not _largest(self.K, self.M) < LARGEST:
+            raise ValueError("K over M leaves the range of numbers; check the units of stiffness and mass")
         if not positive_definite(self.K - shift(self.K, self.M) * self.M):
             raise ValueError("K has negative eigenvalues beyond rounding; check the signs of its springs")
 
@@ -244,7 +247,8 @@ def shift(K: Matrix, M: Matrix) -> float:
 
 def _largest(K: Matrix, M: Matrix) -> float:
     """Order of magnitude of the largest eigenvalue: the largest ratio of diagonals, never zero."""
-    ratio = np.abs(K.diagonal()) / np.maximum(np.abs(M.diagonal()), np.finfo(float).tiny)
+    with np.errstate(over="ignore"):   # infinite, which `Structure` refuses
+        ratio = np.abs(K.diagonal()) / np.maximum(np.abs(M.diagonal()), np.finfo(float).tiny)
     return float(max(ratio.max(), np.finfo(float).tiny))
 
 
