@@ -91,3 +91,4 @@ CASES: dict[str, Case | FiveJoints] = {
         ("five S2", truth.Static, "S2"), ("five S3", truth.Static, "S3"),
         ("five S2 memory", truth.Sliders, "S2"), ("five S3 memory", truth.Sliders, "S3"))},
 }
+QUICK = tuple(name for name, case in CASES.items() if isinstance(case, Case))      # the others take ten seconds and more for each test

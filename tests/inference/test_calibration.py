@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from studies.calibration import truth
-from studies.calibration.cases import CASES
+from studies.calibration import assembly, hard, misfit, scenarios, truth
+from studies.calibration.cases import CASES, QUICK
 from studies.calibration.run import keep, line, rank_p, run, summarise
 
 
@@ -51,9 +51,64 @@ def test_smoke(tmp_path) -> None:
     assert max(result["length_over_known"]) < 1.6
 
 
+def test_misfit_counts_what_is_silently_wrong() -> None:
+    fine = {"flagged": False, "innovation": False, "refused": False, "worst": 2.0, "worst_allowing": 0.5, "worst_backbone": 2.0,
+            "inside90": 0.9, "widening": [2.0, 3.0]}
+    tests = [fine, fine | {"flagged": True, "worst": 40.0, "worst_allowing": 9.0}, fine | {"worst": 20.0}, fine | {"worst_allowing": 4.0}]
+    found = misfit.summarise(tests)
+    assert (found["flagged"], found["silently_wrong"], found["silently_wrong_given_form"]) == (1, 1, 1)
+    assert found["flagged_or_covered"] == 0.75 and found["flagged_or_covered_90"][0] < 0.75 < found["flagged_or_covered_90"][1]
+
+
+def test_hidden_friction_is_flagged_and_its_backbone_is_that_of_the_loss() -> None:
+    found = misfit.run(misfit.TRIALS["coulomb"], 1, 2)
+    assert found["flagged"] == 1 and found["silently_wrong"] == 0 and "coulomb" in misfit.line(found)
+    a, square = np.array([1e-3]), np.array([[4e5]])
+    dry = misfit.Hidden.lost(np.array([[0, 0, 0.0, 0.0, 0.05, 0.0]]), a, square)
+    assert dry[0, 0] == pytest.approx(4 * 0.05 * 1e-3, rel=0.01)      # fast: dry friction loses four times force times amplitude
+
+
+def test_five_joints_conserve_energy_and_hold_their_modes() -> None:
+    """Without damping and joints a mode released from rest keeps its frequency; the backbone at small amplitude is the linear mode."""
+    case = CASES["five S3"]
+    theta = case.draw(3, np.random.default_rng(0))
+    frequency, damping = case.backbone(theta)
+    assert frequency.shape == (3, 5) and np.all(np.diff(frequency) < 0) and np.all(np.diff(damping) > 0)
+    assert frequency[:, 0] == pytest.approx(theta[:, 0], rel=0.01) and len(case.names) == theta.shape[1] == 12
+    assert assembly.slips(3).shape == (5, 3) and len(CASES["five S2 memory"].names) == 12
+
+
+def test_scenarios_count_with_exact_intervals() -> None:
+    assert scenarios.interval(40, 40)[1] == 1.0 and scenarios.interval(40, 40)[0] == pytest.approx(0.05 ** (1 / 40))
+    assert scenarios.interval(0, 40)[0] == 0.0
+
+
+def test_exact_draws_have_the_density_that_the_sampler_sees() -> None:
+    """For each family of hard posteriors: the mean of a ratio of densities over exact draws is one."""
+    for i, family in enumerate(hard.FAMILIES):
+        for seed in range(4):
+            one = family(np.random.default_rng([i, seed]))
+            x = one.draw(4000, np.random.default_rng(1))
+            # nudging draws along by a tenth of their own spread: E[p(x + h)/p(x)] = 1 for a density without bounds
+            h = 0.02 * np.quantile(np.abs(x - np.median(x, axis=0)), 0.2, axis=0)
+            ratio = np.exp(np.clip(one.log(x + h) - one.log(x), -30, 30))
+            assert np.median(ratio) == pytest.approx(1.0, abs=0.5), one.words
+
+
+def test_a_false_converged_is_counted() -> None:
+    """The same density with draws from another: what the run says is held against the exact draws."""
+    one = hard.Posterior("one", "a normal distribution", lambda x: -0.5 * np.sum((x / 0.1) ** 2, axis=1),
+                         lambda n, rng: 0.1 * rng.normal(size=(n, 1)), np.zeros((1, 1)))
+    start = hard.lent(1)
+    right = hard.one_test(one, start, 0)
+    wrong = hard.one_test(hard.Posterior("one", "", one.log, lambda n, rng: 0.05 + 0.1 * rng.normal(size=(n, 1)), one.optima), start, 0)
+    assert right["converged"] and not right["false"] and right["distance"] < 0.06
+    assert wrong["converged"] and wrong["false"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", truth.SCENARIOS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", QUICK)
 def test_twenty_virtual_tests(case: str, scenario: str) -> None:
     """Twenty tests only see gross faults: an honest 90 % covers at least 75 % of 80 correlated values, and ranks are not piled up."""
     result = run(case, scenario, 20, 3)
