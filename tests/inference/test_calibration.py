@@ -98,10 +98,11 @@ def test_exact_draws_have_the_density_that_the_sampler_sees() -> None:
 def test_a_false_converged_is_counted() -> None:
     """The same density with draws from another: what the run says is held against the exact draws."""
     one = hard.Posterior("one", "a normal distribution", lambda x: -0.5 * np.sum((x / 0.1) ** 2, axis=1),
-                         lambda n, rng: 0.1 * rng.normal(size=(n, 1)), np.zeros((1, 1)))
+                         lambda n, rng: 0.1 * rng.normal(size=(n, 1)), np.zeros((1, 1)), (0.1,))
     start = hard.lent(1)
     right = hard.one_test(one, start, 0)
-    wrong = hard.one_test(hard.Posterior("one", "", one.log, lambda n, rng: 0.05 + 0.1 * rng.normal(size=(n, 1)), one.optima), start, 0)
+    other = hard.Posterior("one", "", one.log, lambda n, rng: 0.05 + 0.1 * rng.normal(size=(n, 1)), one.optima, one.widths)
+    wrong = hard.one_test(other, start, 0)
     assert right["converged"] and not right["false"] and right["distance"] < 0.06
     assert wrong["converged"] and wrong["false"]
 

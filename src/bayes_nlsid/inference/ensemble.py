@@ -29,6 +29,7 @@ from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
 from bayes_nlsid.inference.starting import centres, first_walkers, starting_fits
 from bayes_nlsid.inference.target import Target
+from bayes_nlsid.inference.unvisited import with_known_optima
 
 FRESH = 0.5        # share of proposals from the mixture
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
@@ -224,13 +225,15 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
                          f"least 1, "
                          f"block {block} at least 10, most {most} at least one block")
     first, second, third = np.random.SeedSequence(seed).spawn(3)
-    starts = first_walkers(target, centres(target, starting_fits(fit, chosen)), count, first.spawn(ensembles))
+    middle = centres(target, starting_fits(fit, chosen))
+    starts = first_walkers(target, middle, count, first.spawn(ensembles))
     generators = [seeded(child) for child in second.spawn(ensembles)]
     states = [Walkers(s, value, generator) for (s, value), generator in zip(starts, generators, strict=True)]
     kept = Checkpoints(Path(store), identity(target, starts, (seed, ensembles, count, block))) if store is not None else None
     run = _Run(target, block, most, steps, third, kept, progress, stop)
     with Crew(target, executor=executor, workers=min(workers, ensembles)) as crew:
-        return run.go(states, crew).posterior(seed)
+        found = run.go(states, crew).posterior(seed)
+    return with_known_optima(found, target, middle, seed)
 
 
 @final
