@@ -9,7 +9,7 @@ import pytest
 
 from bayes_nlsid.mismatch.evidence import Evidence, gather
 from bayes_nlsid.mismatch.explain import sizes
-from bayes_nlsid.mismatch.joint import pursue, refine, strong
+from bayes_nlsid.mismatch.joint import pursue, refine
 from bayes_nlsid.mismatch.laws import POWER_DAMPER
 from bayes_nlsid.mismatch.linear import Attachment, Family, fields, solve
 from bayes_nlsid.mismatch.paths import LawAlong, bed
@@ -64,7 +64,7 @@ def test_a_damper_that_all_but_locks_its_joint_is_begun_near_the_truth() -> None
                    lambda d, v: POWER_DAMPER.slope(d, v, strength, w, 2.0))
     spectra = steady(fam, theta, (law,), ("J5_slip",), noise=2e-4)
     evidence = gather(spectra, BAND)
-    assert strong(evidence)
+    assert evidence.strong
     bench = bench_of(fam, evidence)
     begun = strong_starts(bench, np.zeros(fam.size))
     assert {h.effects[0].place for h in begun} == {"J5_slip"}

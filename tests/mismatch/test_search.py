@@ -11,7 +11,7 @@ from bayes_nlsid.mismatch.calibrate import calibrate
 from bayes_nlsid.mismatch.effects import Effect
 from bayes_nlsid.mismatch.evidence import gather
 from bayes_nlsid.mismatch.explain import Candidate, scan_forces, scan_linear
-from bayes_nlsid.mismatch.joint import estimate, refine, strong
+from bayes_nlsid.mismatch.joint import estimate, refine
 from bayes_nlsid.mismatch.linear import fields, solve
 from bayes_nlsid.mismatch.paths import bed
 from bayes_nlsid.mismatch.polish import Bench
@@ -86,7 +86,7 @@ def test_a_strong_law_is_found_from_a_calibration_that_it_has_bent() -> None:
     evidence = gather(spectra, BAND)
     s = spectra.s[spectra.excited]
     bent, soft = (calibrate(fam, s, evidence.H, v) for v in (evidence.variance, evidence.doubted(evidence.residual)))
-    assert strong(evidence)
+    assert evidence.strong
     # the place itself takes up the mean stiffness of the law either way; the others are left alone
     assert all(np.abs(fit.theta[:2] - theta[:2]).max() < 0.01 for fit in (soft, bent))
     candidates, _, sizes = scan_forces(fam, soft, evidence, list(fam.places))

@@ -18,6 +18,7 @@ from bayes_nlsid.mismatch.spectra import Spectra, local_mean
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+STRONG = 1.5   # chi² of the projected residual over its expectation
 CANDIDATE_ERROR = 0.05  # relative error of the paths from a place to the sensors, granted to every candidate
 
 
@@ -71,6 +72,11 @@ class Evidence:
         """Real degrees of freedom behind ``chi2``."""
         records, lines, channels = self.residual.shape
         return 2 * channels * (int(self.excited.sum()) * (records - 1) + int((~self.excited).sum()) * records)
+
+    @property
+    def strong(self) -> bool:
+        """Whether what is not linear stands so far above the noise that the transfer function may be bent by it."""
+        return self.chi2 > STRONG * self.values
 
     def doubted(self, residual: Complex) -> Array:
         """(Le, S): variance of the transfer function where it may be bent as much as the unexplained ``residual`` (R, L, S) is large."""

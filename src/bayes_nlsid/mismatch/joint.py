@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit, System, assemble, finish, floored, stack
 from bayes_nlsid.mismatch.effects import Effect, extension, packed, unpack
-from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.linear import solve
 from bayes_nlsid.mismatch.paths import bed
@@ -35,7 +34,6 @@ from bayes_nlsid.mismatch.spectra import repeats
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-STRONG = 1.5   # chi² of the projected residual over its expectation
 NEARBY = 1.25  # times the end of the band, up to where a mode's own deviations move the places noticeably
 
 
@@ -62,7 +60,6 @@ class Joint:
         self.rows = np.array([bench.family.places[p] for p in self.places])
         self.ext = extension(h.kinds, len(bench.channels))
         self.unique = repeats(bench.evidence.spectra)
-        self.coarse = 2 if strong(bench.evidence) else 1    # steps per sample; what a strong law does to resonances asks for shorter ones
         self.root = np.sqrt(2 * bench.evidence.trust[:, None, None] * bench.evidence.weight)
         self.y0 = [packed(e, e) for e in self.forces]
         self.edges = np.concatenate([[0], np.cumsum([len(p) for p in self.y0])]).astype(int)
@@ -92,7 +89,7 @@ class Joint:
         fld = replace(self.h.fit.fields, modes=modes)
         fit = replace(self.h.fit, fields=fld, shape_errors=errors)
         h = paths_to_sensors(bench, fit, self.places, spectra.s, parts(spectra.s))
-        paths = replace(paths, marched=self.coarse) if coarse else paths
+        paths = replace(paths, marched=bench.marched[coarse])
         there = simulate(paths, spectra, self.effects(y), self.unique, warm, most=most, march_only=search)
         projected = np.stack([evidence.project(there.lines[:, :, j]) for j in range(len(self.forces))], axis=-1)
         residual = (evidence.residual + np.einsum("lsj,rlj->rls", h, projected, optimize=True)) * self.root
@@ -127,15 +124,10 @@ def estimate(bench: Bench, start: LinearFit, candidates: tuple[Candidate, ...], 
     return pursue(bench, begin(bench, start, candidates))
 
 
-def strong(evidence: Evidence) -> bool:
-    """Whether what is not linear stands so far above the noise that the transfer function may be bent by it."""
-    return evidence.chi2 > STRONG * evidence.values
-
-
 def pursue(bench: Bench, h: Hypothesis) -> Hypothesis:
     """Joint estimation from where a law begins: where it is strong, first with a transfer function that is doubted as far as the law leaves
     something unexplained, for a wrong law bends the linear model."""
-    if strong(bench.evidence):
+    if bench.evidence.strong:
         there = refine(bench, refine(bench, h, steps=5, quick=True, doubt=True), steps=6, quick=True)
         return there if there.cost < h.cost else h
     return refine(bench, h, steps=4, quick=True)
@@ -288,4 +280,4 @@ def _columns(system: System, change: Complex, laws: int) -> tuple[Array, Array]:
     return normal, gradient
 
 
-__all__ = ["Joint", "Point", "estimate", "pursue", "refine", "strong"]
+__all__ = ["Joint", "Point", "estimate", "pursue", "refine"]

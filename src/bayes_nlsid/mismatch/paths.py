@@ -103,11 +103,6 @@ class Bed:
     rows: Array
     marched: int = MARCHED
 
-    @property
-    def coarse(self) -> Bed:
-        """The same with the longest steps of a march: for derivatives, which need no more."""
-        return replace(self, marched=1)
-
     def at(self, places: list[int]) -> Bed:
         """Some of the places alone."""
         return replace(self, to_force=self.to_force[:, places], among=self.among[:, places][:, :, places], rows=self.rows[places])

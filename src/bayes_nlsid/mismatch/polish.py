@@ -22,7 +22,7 @@ from bayes_nlsid.mismatch.explain import Candidate
 from bayes_nlsid.mismatch.laws import Size
 from bayes_nlsid.mismatch.linear import Attachment, Family
 from bayes_nlsid.mismatch.motion import settle
-from bayes_nlsid.mismatch.paths import Bed, bed
+from bayes_nlsid.mismatch.paths import MARCHED, Bed, bed
 from bayes_nlsid.mismatch.shapes import accelerance
 from bayes_nlsid.mismatch.spectra import Spectra, repeats
 
@@ -48,6 +48,11 @@ class Bench:
     mass: float
     stiffness: dict[str, float]
     sizes: dict[str, Size]
+
+    @property
+    def marched(self) -> tuple[int, int]:
+        """Steps per sample of a march, and of one for derivatives: what a strong law does to sharp resonances asks for short ones."""
+        return (MARCHED, MARCHED // 2) if self.evidence.strong else (MARCHED // 2, 1)
 
 
 @final
@@ -339,7 +344,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     places = [e.place for e in forces]
     rows = np.array([fam.places[p] for p in places])
     parts = ((lambda s: ((), None)) if ext is None else partial(ext.parts, x))
-    paths = bed(fit.fields.modes, spectra, rows, fam.shaker, lambda s: parts(s)[0])
+    fine, quick = (replace(bed(fit.fields.modes, spectra, rows, fam.shaker, lambda s: parts(s)[0]), marched=m) for m in bench.marched)
     h = paths_to_sensors(bench, fit, places, spectra.s, parts(spectra.s))
     root = np.sqrt(2 * evidence.trust[:, None, None] * evidence.weight)
     data = evidence.residual * root
@@ -355,13 +360,13 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         return tuple(unpack(e, y[a:b], ref) for e, ref, a, b in zip(forces, reference, edges[:-1], edges[1:], strict=True))
 
     y = np.concatenate([packed(e, ref) for e, ref in zip(forces, reference, strict=True)])
-    now = simulate(paths, spectra, forces, unique, None, march_only=True)
+    now = simulate(fine, spectra, forces, unique, None, march_only=True)
     rest = data - response(now.lines)
     cost = float((np.abs(rest) ** 2).sum())
     for _ in range(weaker):
         # the first search saw the law on the motion without it: a strong one moves its place less, or otherwise
         less_of_it = tuple(weakened(e, 0.5) for e in forces)
-        there = simulate(paths, spectra, less_of_it, unique, None, march_only=True)
+        there = simulate(fine, spectra, less_of_it, unique, None, march_only=True)
         left = data - response(there.lines)
         less = float((np.abs(left) ** 2).sum())
         if not less < cost:
@@ -371,11 +376,11 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
     normal = np.eye(len(y))
     for _ in range(steps):
         columns = np.empty((len(y), *rest.shape), dtype=complex)
-        still = simulate(paths.coarse, spectra, effects_at(y), unique, now.motions, most=12, march_only=True)
+        still = simulate(quick, spectra, effects_at(y), unique, now.motions, most=12, march_only=True)
         for i in range(len(y)):
             step = 1e-3
             beside = effects_at(y + step * (np.arange(len(y)) == i))
-            moved = simulate(paths.coarse, spectra, beside, unique, now.motions, most=12, march_only=True)
+            moved = simulate(quick, spectra, beside, unique, now.motions, most=12, march_only=True)
             columns[i] = (response(moved.lines) - response(still.lines)) / step
         flat, r = columns.reshape(len(y), -1), rest.ravel()
         normal = (flat.conj() @ flat.T).real + 1e-2 * np.eye(len(y))
@@ -383,7 +388,7 @@ def _fit_laws(bench: Bench, fit: LinearFit, ext: Extension | None, x: Array, for
         accepted = False
         for _ in range(4):
             trial = y + np.clip(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), -0.7, 0.7)
-            tried = simulate(paths, spectra, effects_at(trial), unique, now.motions, march_only=True)
+            tried = simulate(fine, spectra, effects_at(trial), unique, now.motions, march_only=True)
             left = data - response(tried.lines)
             new = float((np.abs(left) ** 2).sum())
             if np.isfinite(new) and new < cost:

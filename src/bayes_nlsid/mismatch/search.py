@@ -13,7 +13,7 @@ from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.effects import Effect, pack, weakened
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
-from bayes_nlsid.mismatch.joint import estimate, pursue, refine, strong
+from bayes_nlsid.mismatch.joint import estimate, pursue, refine
 from bayes_nlsid.mismatch.polish import WEAKER, Bench, Hypothesis, begin, estimate_linear, everywhere
 from bayes_nlsid.mismatch.quasilinear import strong_starts
 
@@ -65,11 +65,11 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     top_force = forces[0].gain if forces else 0.0
     top_linear = linear[0].gain if linear else 0.0
     # what no law moves by a fiftieth is no law's doing, however far it stands above the noise
-    hopeless = strong(bench.evidence) and top_force < 0.02 * (bench.evidence.chi2 - bench.evidence.values)
+    hopeless = bench.evidence.strong and top_force < 0.02 * (bench.evidence.chi2 - bench.evidence.values)
     short = [] if hopeless else _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
     begun = [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short]
-    if short and strong(bench.evidence):
+    if short and bench.evidence.strong:
         begun += strong_starts(bench, (fit, *others)[-1].theta)
     singles = _pursued(bench, begun)
     # a law that explains more than any linear effect could makes those superfluous as first effects
@@ -152,13 +152,13 @@ def _pooled(bench: Bench, fits: tuple[LinearFit, ...], places: list[str]
 def _begun(bench: Bench, c: Candidate, starts: Sequence[LinearFit]) -> Hypothesis:
     """Where a law begins, by the calibration from which it leaves least of the projected residual."""
     different = [f for i, f in enumerate(starts) if all(f is not g for g in starts[:i])]
-    return min((begin(bench, f, (c,)) for f in (different if strong(bench.evidence) else different[:1])), key=lambda h: h.misfit_records)
+    return min((begin(bench, f, (c,)) for f in (different if bench.evidence.strong else different[:1])), key=lambda h: h.misfit_records)
 
 
 def _pursued(bench: Bench, begun: list[Hypothesis], most: int = 5) -> list[Hypothesis]:
     """Laws estimated jointly from where they began, of strong ones only those that began well."""
     order = sorted(begun, key=lambda h: h.misfit_records)
-    many = most if strong(bench.evidence) else len(order)
+    many = most if bench.evidence.strong else len(order)
     out: list[Hypothesis] = []
     for h in order[:many]:
         if not _beaten(bench, h, out, 4.0):
@@ -170,14 +170,14 @@ def _beaten(bench: Bench, h: Hypothesis, others: list[Hypothesis], times: float)
     """Whether a strong law leaves so many times more unexplained than another that it will not catch up."""
     values = bench.evidence.values
     best = min((o.misfit_records for o in others), default=np.inf)
-    return strong(bench.evidence) and h.misfit_records - values > times * max(best - values, 0.2 * values)
+    return bench.evidence.strong and h.misfit_records - values > times * max(best - values, 0.2 * values)
 
 
 def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], most: int = 3
                ) -> tuple[list[Hypothesis], dict[tuple[str, str], float]]:
     """All derivatives for the laws that lead and the one that promised most in the first search, where much is left: the linear model
     that a strong law has bent comes back with them only. With the cost of those that need no more."""
-    if not singles or not strong(bench.evidence) or not _poor(bench, singles[0], 1.2):
+    if not singles or not bench.evidence.strong or not _poor(bench, singles[0], 1.2):
         return singles, {}
     promised = {c.effect.key: c.gain for c in short}
     forces = [h for h in singles if h.forces and len(h.effects) == 1]
@@ -352,7 +352,7 @@ def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[floa
             if c.gain > max(SECOND, 0.02 * left) and c.effect.key not in own]
     lead = _lead(first)
     out = []
-    for c in sorted(pool, key=lambda c: -c.gain)[:3 if strong(bench.evidence) else 4]:
+    for c in sorted(pool, key=lambda c: -c.gain)[:3 if bench.evidence.strong else 4]:
         pair = (*lead, c)
         start = first.fit
         if not first.forces and c.effect.is_force:
