@@ -148,10 +148,15 @@ def everywhere(bench: Bench, h: Hypothesis, places: list[str]) -> tuple[Bed, lis
     found = simulate(own, spectra, h.forces, repeats(spectra), None)
     out = []
     for r, D in enumerate(found.motions):
-        d, v = own.in_time(D)
-        g = np.stack([law_of(e, times[r], own.periodic).force(d[:, j], v[:, j], own.dt) for j, e in enumerate(h.forces)], axis=1)
+        g = np.concatenate([force_in_time(own.at([j]), e, D[:, j:j + 1], times[r]) for j, e in enumerate(h.forces)], axis=1)
         out.append(np.asarray(paths.linear(r) - np.einsum("kjp,kp->kj", paths.among[:, :, at], own.to_lines(g), optimize=True)))
     return paths, out
+
+
+def force_in_time(paths: Bed, effect: Effect, D: Complex, time: float) -> Array:
+    """(n, 1): force of an effect along the motion (K, 1) of the only place of ``paths``, in a record taken at ``time`` (−1 to 1)."""
+    d, v = paths.in_time(D)
+    return np.asarray(law_of(effect, time, paths.periodic).force(d[:, 0], v[:, 0], paths.dt))[:, None]
 
 
 def widened(fam: Family, sd: Array, places: set[str]) -> Array:

@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Progress = Callable[[str], None]
 FAINT, FAINT_PLACE = 12.0, 18.0  # gains that the best of all channels, or of all places, has by chance
-TRIED = 10  # rivals that are run on the records kept aside
+TRIED = 8  # rivals that are run on the records kept aside
+IN_VIEW = 0.2  # gain over the best, from which a rival is worth that
 
 
 @final
@@ -236,10 +237,11 @@ def on_trial(case: Case, bench: Bench, fit: LinearFit, rivals: list[Rival], held
 
     none = error(fit, None, ())
     known: dict[int, float] = {id(None): none}
+    least = IN_VIEW * max((r.gain for r in rivals), default=0.0)
     out = []
     for r in rivals:
         mark = id(r.hypothesis)
-        if mark not in known and len(known) <= TRIED:
+        if mark not in known and len(known) <= TRIED and r.gain >= least:
             known[mark] = error(r.hypothesis.fit, r.hypothesis, r.clip) if r.hypothesis is not None else none
         out.append(replace(r, held=known.get(mark, float("nan"))))
     return out, none

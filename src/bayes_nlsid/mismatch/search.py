@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.catalogue import ROWS
-from bayes_nlsid.mismatch.effects import Effect, pack, weakened
+from bayes_nlsid.mismatch.effects import Effect, pack
 from bayes_nlsid.mismatch.explain import Candidate, Latent, forced, scan_forces, scan_linear
 from bayes_nlsid.mismatch.joint import estimate, pursue, refine
-from bayes_nlsid.mismatch.polish import WEAKER, Bench, Hypothesis, begin, estimate_linear, everywhere
+from bayes_nlsid.mismatch.pairs import better, members, second_effects, unique
+from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin, estimate_linear, everywhere
 from bayes_nlsid.mismatch.quasilinear import strong_starts
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 WORTH = 14.0  # smallest gain of one regression that is looked at more closely
-SECOND = 25.0  # the same for a second effect
 FIRST_FEW = 2  # linear effects that are estimated first from a linear fit that is no good
 CLEAR = 1000.0  # gain of a linear effect that its column promises nearly rightly
 KINDS = ("displacement", "velocity", "memory")   # what a law may follow
@@ -79,32 +79,32 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
         say(f"estimating {len(columns)} linear effects")
         fit, estimates = _estimated(bench, fit, band, columns)
         none = bench.evidence.chi2 + fit.cost
-        singles = _better(singles, estimates)
+        singles = better(singles, estimates)
         if estimates and none - estimates[0].cost > WORTH and singles[0].fit.cost > 1.02 * singles[0].fit.dof:
             # a stiff relaxing branch has a column that is a poor guide: try one at every joint, if nothing simpler explains the data
             centre = 1.5 * float(np.sqrt(band[0] * band[1]))
             slow = [Candidate(Effect("other", place, kind="maxwell"), 0.0, 0.5, centre) for place in bench.family.places]
-            singles = _better(singles, [estimate(bench, fit, (c,)) for c in slow])
+            singles = better(singles, [estimate(bench, fit, (c,)) for c in slow])
     singles, finished = _promising(bench, singles, short)
     if not linear_too and latents and singles and singles[0].misfit_records > 2 * bench.evidence.values:
         where = max(latents, key=lambda x: x.explained).place
         if where != singles[0].effects[0].place:
             say("trying strong laws where a free force explains most")
             tried = forced(bench.family, fit, bench.evidence, where, bench.sizes[where], 0.4)
-            singles = _better(singles, _pursued(bench, [begin(bench, fit, (c,)) for c in tried], most=2))
+            singles = better(singles, _pursued(bench, [begin(bench, fit, (c,)) for c in tried], most=2))
     singles = _again(bench, singles, places, none, say)
     singles = _finish_leaders(bench, singles, none, finished)
     singles = _other_formulas(bench, singles, none, say)
     doubles: list[Hypothesis] = []
     if singles and none - singles[0].cost > 30:
         say("looking for a second effect")
-        doubles = _second(bench, singles[0], places, band)
+        doubles = second_effects(bench, singles[0], places, band)
         before = singles[0]
-        singles = _better(singles, _members(bench, singles[0], doubles, none - singles[0].cost))
+        singles = better(singles, members(bench, singles[0], doubles, none - singles[0].cost))
         if singles[0] is not before:
             say("a member of a pair leads alone: looking for a second effect beside it")
             singles = _finish_leaders(bench, singles, none, finished)
-            doubles = _better(doubles, _second(bench, singles[0], places, band))
+            doubles = better(doubles, second_effects(bench, singles[0], places, band))
     return Found(none, fit, tuple(singles), tuple(doubles), tuple(latents), tuple(sorted(forces + linear, key=lambda c: -c.gain)))
 
 
@@ -119,7 +119,7 @@ def _estimated(bench: Bench, fit: LinearFit, band: tuple[float, float], columns:
     def tried(some: list[Candidate]) -> list[Hypothesis]:
         out = found
         for c in some:
-            out = _better(out, [estimate(bench, fit, (c,), out[0].fit.cost if out else np.inf)])
+            out = better(out, [estimate(bench, fit, (c,), out[0].fit.cost if out else np.inf)])
         return out
 
     for _ in range(3):
@@ -163,7 +163,7 @@ def _pursued(bench: Bench, begun: list[Hypothesis], most: int = 5) -> list[Hypot
     for h in order[:many]:
         if not _beaten(bench, h, out, 4.0):
             out.append(pursue(bench, h))
-    return _better(order, out)
+    return better(order, out)
 
 
 def _beaten(bench: Bench, h: Hypothesis, others: list[Hypothesis], times: float) -> bool:
@@ -184,17 +184,7 @@ def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], 
     first = sorted(forces, key=lambda h: -promised.get(h.effects[0].key, 0.0))[:1]
     chosen = [h for h in first + [h for h in forces if h is not first[0]][:most - 1] if not _beaten(bench, h, forces, 3.0)]
     refined = [refine(bench, h, steps=8) for h in chosen]
-    return _better(singles, refined), {h.effects[0].key: h.cost for h in refined}
-
-
-def _unique(candidates: list[Candidate]) -> list[Candidate]:
-    seen: set[tuple[str, str]] = set()
-    out = []
-    for c in candidates:
-        if c.effect.key not in seen:
-            seen.add(c.effect.key)
-            out.append(c)
-    return out
+    return better(singles, refined), {h.effects[0].key: h.cost for h in refined}
 
 
 def _worth(c: Candidate) -> bool:
@@ -210,7 +200,7 @@ def _short_forces(candidates: list[Candidate], other: float, most: int = 7) -> l
     if not candidates:
         return []
     top = candidates[0]
-    keep = [c for c in _unique(candidates) if c.gain > max(WORTH, 0.2 * top.gain, 0.2 * other)]
+    keep = [c for c in unique(candidates) if c.gain > max(WORTH, 0.2 * top.gain, 0.2 * other)]
     here = [c for c in keep if c.effect.place == top.effect.place]
     there = [c for c in keep if c.effect.place != top.effect.place and c.gain > 0.35 * top.gain]
     remembered = 0
@@ -248,17 +238,7 @@ def _short_linear(candidates: list[Candidate], most: int = 7) -> list[Candidate]
         return []
     top = candidates[0].gain
     limit = max(WORTH, (0.15 if top < CLEAR else 0.5) * top)
-    return [c for c in _unique(candidates) if c.gain > limit][:most]
-
-
-def _better(first: list[Hypothesis], second: list[Hypothesis]) -> list[Hypothesis]:
-    """One hypothesis per key, the cheaper of two estimates."""
-    best: dict[tuple, Hypothesis] = {}
-    for h in first + second:
-        key = tuple(e.key for e in h.effects)
-        if key not in best or h.cost < best[key].cost:
-            best[key] = h
-    return sorted(best.values(), key=lambda h: h.cost)
+    return [c for c in unique(candidates) if c.gain > limit][:most]
 
 
 def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: float, say: Progress, turns: int = 2) -> list[Hypothesis]:
@@ -276,9 +256,9 @@ def _again(bench: Bench, singles: list[Hypothesis], places: list[str], none: flo
         forces, _, _ = scan_forces(bench.family, lead.fit, bench.evidence, places, None, paths, motions)
         top = forces[0].gain if forces else 0.0
         own = lead.effects[0]
-        fresh = [c for c in _unique(forces) if c.gain > 0.5 * top and (c.effect.key != own.key or c.effect.law is not own.law)]
+        fresh = [c for c in unique(forces) if c.gain > 0.5 * top and (c.effect.key != own.key or c.effect.law is not own.law)]
         tried = _pursued(bench, [begin(bench, lead.fit, (c,)) for c in fresh[:4]], most=1)
-        new = _better([lead, *singles], tried)
+        new = better([lead, *singles], tried)
         won = new[0].cost < lead.cost - 1.0
         singles = new
         if not won:
@@ -336,85 +316,4 @@ def _other_formulas(bench: Bench, singles: list[Hypothesis], none: float, say: P
             tried = begin(bench, h.fit, (c,))
             if not _beaten(bench, tried, [h], 4.0):
                 out.append(refine(bench, tried, steps=6, quick=True))
-    return _better(singles, out)
-
-
-def _second(bench: Bench, first: Hypothesis, places: list[str], band: tuple[float, float]) -> list[Hypothesis]:
-    """Pairs of the best single with what its residual still shows.
-
-    A second effect must gain more than chance and than errors of the first law make: a fiftieth of what that leaves unexplained.
-    """
-    left = max(first.misfit_records - bench.evidence.values, 0.0) + max(first.fit.cost - first.fit.dof, 0.0)
-    forces, _, _ = scan_forces(bench.family, first.fit, bench.evidence, places, first.residual)
-    linear = scan_linear(bench.family, first.fit, bench.channels, bench.mass, bench.stiffness, band)
-    own = {e.key for e in first.effects}
-    pool = [c for c in _unique(forces)[:3] + _unique(linear)[:4]
-            if c.gain > max(SECOND, 0.02 * left) and c.effect.key not in own]
-    lead = _lead(first)
-    out = []
-    for c in sorted(pool, key=lambda c: -c.gain)[:3 if bench.evidence.strong else 4]:
-        pair = (*lead, c)
-        start = first.fit
-        if not first.forces and c.effect.is_force:
-            pair = (c, *lead)
-        out.append(_paired(bench, start, pair))
-    return sorted(out, key=lambda h: h.cost)
-
-
-def _paired(bench: Bench, start: LinearFit, pair: tuple[Candidate, ...]) -> Hypothesis:
-    """Joint estimation of a pair whose first member is known.
-
-    A linear effect beside a law is first estimated on the transfer function that the law leaves, the law held.
-    """
-    if not any(c.effect.is_force for c in pair):
-        return estimate(bench, start, pair)
-    linear = tuple(c for c in pair if not c.effect.is_force)
-    if len(linear) == 1 and not len(start.x):
-        left = replace(bench, evidence=replace(bench.evidence, H=start.measured, variance=start.variance))
-        start = estimate_linear(left, start, linear).fit
-    begun = begin(bench, start, pair, steps=1, weaker=0)
-    for _ in range(WEAKER if not linear else 0):
-        # the second law was seen on a motion that it changes itself
-        pair = (*pair[:-1], replace(pair[-1], effect=weakened(pair[-1].effect, 0.5)))
-        less = begin(bench, start, pair, steps=1, weaker=0)
-        if not less.misfit_records < begun.misfit_records:
-            break
-        begun = less
-    return refine(bench, begun, steps=4, quick=True)
-
-
-def _members(bench: Bench, lead: Hypothesis, doubles: list[Hypothesis], gained: float) -> list[Hypothesis]:
-    """Members of the best pairs, each alone from where the pair has left it, if the pair gains much: what leads may lead only because its
-    rival began badly."""
-    out: dict[tuple[str, str], Hypothesis] = {}
-    for pair in sorted(doubles, key=lambda h: h.cost)[:2]:
-        if lead.cost - pair.cost < max(20.0, 0.02 * pair.fit.dof if pair.forces else 0.0, 0.1 * gained):
-            break
-        for candidate in _lead(pair):
-            key = candidate.effect.key
-            if key not in out and key != lead.effects[0].key:
-                out[key] = estimate(bench, pair.fit, (candidate,))
-    return list(out.values())
-
-
-def _lead(first: Hypothesis) -> tuple[Candidate, ...]:
-    """Candidates that reproduce a hypothesis as a start: forces keep their values, linear effects their coordinates."""
-    out, edge = [], 0
-    kinds = list(first.kinds)
-    for e in first.effects:
-        if e.is_force or e.cls == "linear_stiffness":
-            out.append(Candidate(e, 0.0))
-            continue
-        k = kinds.pop(0)
-        x = first.fit.x[edge:edge + len(k.start)]
-        edge += len(k.start)
-        logs = e.cls in ("unmodelled_mode",) or e.kind == "maxwell"
-        frequency = 0.0
-        if logs:
-            frequency = float(e.values[1]) if e.cls == "unmodelled_mode" else 1 / (2 * np.pi * float(e.values[1]))
-        out.append(Candidate(replace(e, values=np.zeros(0)), 0.0, float(np.exp(x[0])) if logs else float(x[0]), frequency, _other(k)))
-    return tuple(out)
-
-
-def _other(kind: object) -> int:
-    return int(getattr(kind, "other", -1))
+    return better(singles, out)
