@@ -62,6 +62,7 @@ def test_given_standard_deviations_are_taken(tmp_path: Path) -> None:
     ("frequency,damping [%],A\n16,1,1\n", r"'frequency' has no unit; head it frequency \[Hz\]"),
     ("frequency [Hz],damping,A\n16,1,1\n", r"'damping' has no unit; head it damping \[%\]"),
     ("frequency [Hz],damping [dB],A\n16,1,1\n", "unknown unit 'dB'"), ("frequency [Hz],A\n16,1\n", "no column damping"),
+    ("frequency [Hz],damping [%],A\n16,1,inf\n", "shape 'A' holds values that are no numbers"),
     ("frequency [Hz],damping [%],C\n16,1,1\n", r"none of its shapes \(C\) is called"),
     ("frequency [Hz],damping [%]\n16,1\n", "there are none"), ("frequency [Hz],damping [%],A\n-16,1,1\n", "mode 1 has frequency -16"),
     ("frequency [Hz],damping [%],A\n16,1,1\n16,100,1\n", "mode 2 .* damping ratio 1"),

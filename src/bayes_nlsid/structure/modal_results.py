@@ -60,6 +60,8 @@ def read_modal_results(path: Path, locations: Sequence[str], sensors: Mapping[st
         if plain not in table.shapes:
             raise InputError(str(path), f"holds no shape {plain!r} (for location {location!r})",
                              f"it holds {', '.join(list(table.shapes)[:12])}")
+        if not np.isfinite(table.shapes[plain]).all():
+            raise InputError(str(path), f"shape {plain!r} holds values that are no numbers", "export the modes again")
         columns.append(sign * table.shapes[plain])
     return _modes(path, table, tuple(wanted), np.array(columns))
 
