@@ -177,12 +177,13 @@ def test_two_modes_far_apart_are_flagged_or_joined(monkeypatch):
     def two(x):
         return np.logaddexp(-0.5 * ((x[:, 0] - 0.5) / 1e-4) ** 2, -0.5 * ((x[:, 0] + 0.5) / 1e-4) ** 2)
 
+    monkeypatch.setattr(ensemble, "first_proposal", lambda *_: None)
     scatter = 1e-4 * np.random.default_rng(0).normal(size=(2, 20, 1))
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + 0.5))
     same = settled(Written(start, two), start, ensembles=2, steps=200, most=1200)
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(scatter + np.array([0.5, -0.5])[:, None, None]))
     joined = settled(Written(start, two), start, ensembles=2, steps=600, most=1400)
-    monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
+    monkeypatch.setattr(ensemble, "learn_proposal", lambda *_: None)
     apart = settled(Written(start, two), start, ensembles=2, steps=300, most=1200)
     assert same.status == "ok"
     assert joined.convergence.converged and np.mean(joined.flat > 0) == pytest.approx(0.5, abs=0.05)
@@ -217,7 +218,8 @@ def test_stuck_walkers_are_redrawn_in_burn_in_and_counted(monkeypatch):
     monkeypatch.setattr(ensemble, "first_walkers", begin_at(points))
     freed = settled(Written(start, trap), start, ensembles=2, steps=200)
     assert freed.convergence.stuck_walkers == 0    # a proposal from the mixture frees it
-    monkeypatch.setattr(ensemble, "learn_mixture", lambda draws, seed: None)
+    for name in ("learn_proposal", "first_proposal"):
+        monkeypatch.setattr(ensemble, name, lambda *_: None)
     found = settled(Written(start, trap), start, ensembles=2, steps=200)
     assert found.convergence.stuck_walkers == 2
     assert (found.flat > 0).all()

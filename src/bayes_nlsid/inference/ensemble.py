@@ -3,7 +3,8 @@
 Moves: differential evolution 0.7, with full-length jumps between modes 0.1, snooker 0.2. They need three to four times fewer
 evaluations than the stretch move in 20 to 40 dimensions. The snooker move is our own: that of emcee 3.1.6 scales its step with the
 distance to the anchor without paying for it, and gives a Gaussian in five dimensions 0.7 of its variance. Once burn-in has shown the
-shape of the posterior, half of all proposals come from a mixture learnt from it (``mixture``).
+shape of the posterior, half of all proposals come from a mixture learnt from it (``proposal``). Walkers move in coordinates of their own
+(``ridges``); everything that leaves a block is in search coordinates.
 """
 
 from __future__ import annotations
@@ -24,16 +25,18 @@ from bayes_nlsid.inference.block import Block, Walkers
 from bayes_nlsid.inference.checkpoint import Checkpoints, identity
 from bayes_nlsid.inference.convergence import LENGTH, Convergence, assess, integrated_time, stuck
 from bayes_nlsid.inference.likelihood import Likelihood, WhittleLikelihood
-from bayes_nlsid.inference.mixture import Mixture, learn_mixture
+from bayes_nlsid.inference.mixture import Mixture
 from bayes_nlsid.inference.posterior import Posterior
 from bayes_nlsid.inference.prior import Prior, default_priors
-from bayes_nlsid.inference.starting import centres, first_walkers, starting_fits
+from bayes_nlsid.inference.proposal import Proposal, learn_proposal
+from bayes_nlsid.inference.starting import centres, first_proposal, first_walkers, neighbourhoods, starting_fits
 from bayes_nlsid.inference.target import Target
 from bayes_nlsid.inference.unvisited import with_known_optima
 
 FRESH = 0.5        # share of proposals from the mixture
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
 KEEP_FAILED = 20   # failed points remembered per block
+ASKED = 4000       # draws on which two proposals are compared
 Array = NDArray[np.float64]
 
 
@@ -80,7 +83,7 @@ def _fresh_class() -> type:
     class Fresh(RedBlueMove):
         """A new place drawn from a mixture that stands still, whatever the old one (Tierney 1994)."""
 
-        def __init__(self, mixture: Mixture) -> None:
+        def __init__(self, mixture: Mixture | Proposal) -> None:
             super().__init__()
             self.mixture = mixture
 
@@ -92,7 +95,7 @@ def _fresh_class() -> type:
     return Fresh
 
 
-def moves(mixture: Mixture | None = None) -> list[tuple[Any, float]]:
+def moves(mixture: Mixture | Proposal | None = None) -> list[tuple[Any, float]]:
     """Moves and their shares."""
     from emcee.moves import DEMove
 
@@ -100,7 +103,7 @@ def moves(mixture: Mixture | None = None) -> list[tuple[Any, float]]:
     return local if mixture is None else [*((move, share * (1 - FRESH)) for move, share in local), (_fresh_class()(mixture), FRESH)]
 
 
-def run_block(target: Target, start: Walkers, steps: int, mixture: Mixture | None = None) -> Block:
+def run_block(target: Target, start: Walkers, steps: int, mixture: Proposal | None = None) -> Block:
     """Advance one ensemble; the result depends on nothing but the arguments.
 
     Parameters
@@ -109,8 +112,8 @@ def run_block(target: Target, start: Walkers, steps: int, mixture: Mixture | Non
     start : Walkers
         All of finite log density.
     steps : int
-    mixture : Mixture or None
-        From which half of the proposals are drawn.
+    mixture : Proposal or None
+        From which half of the proposals are drawn, in coordinates of the walk.
 
     Returns
     -------
@@ -118,13 +121,15 @@ def run_block(target: Target, start: Walkers, steps: int, mixture: Mixture | Non
     """
     import emcee
 
+    ridges = target.ridges
     count: list[int] = [0]
     where: list[Array] = []
 
     interrupted = [False]
 
-    def density(s: Array) -> Array:
+    def density(z: Array) -> Array:
         # emcee prints what it catches; an interruption waits for the end of a block that is then thrown away.
+        s = ridges.to_s(z)
         try:
             value, failed = target.parts(s) if not interrupted[0] else (np.full(len(s), -np.inf), np.zeros(len(s), dtype=bool))
         except KeyboardInterrupt:
@@ -133,21 +138,23 @@ def run_block(target: Target, start: Walkers, steps: int, mixture: Mixture | Non
         count[0] += int(failed.sum())
         if failed.any() and len(where) < KEEP_FAILED:
             where.extend(s[failed])
-        return value
+        return np.where(np.isfinite(value), value + ridges.log_jacobian(z), -np.inf)
 
     walkers, dimensions = start.s.shape
     sampler = emcee.EnsembleSampler(walkers, dimensions, density, moves=moves(mixture), vectorize=True)
-    state = emcee.State(start.s, log_prob=start.log_prob, random_state=start.random)
-    end = sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
+    z = ridges.to_walk(start.s)
+    state = emcee.State(z, log_prob=start.log_prob + ridges.log_jacobian(z), random_state=start.random)
+    sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
     if interrupted[0]:
         raise KeyboardInterrupt
-    final_state = Walkers(np.array(end.coords), np.array(end.log_prob), tuple(sampler.random_state))
+    chain, value = np.array(sampler.get_chain()), np.array(sampler.get_log_prob())
+    s, value = ridges.to_s(chain), value - ridges.log_jacobian(chain)
+    final_state = Walkers(s[-1], value[-1], tuple(sampler.random_state))
     failed_at = target.to_theta(np.array(where[:KEEP_FAILED])) if where else np.zeros((0, dimensions))
-    return Block(np.array(sampler.get_chain()), np.array(sampler.get_log_prob()), np.asarray(sampler.backend.accepted, dtype=float),
-                 final_state, count[0], failed_at)
+    return Block(s, value, np.asarray(sampler.backend.accepted, dtype=float), final_state, count[0], failed_at)
 
 
-def _advance(target: Target, task: tuple[Walkers, int, Mixture | None]) -> Block:
+def _advance(target: Target, task: tuple[Walkers, int, Proposal | None]) -> Block:
     """The same as a task that can be given away."""
     return run_block(target, *task)
 
@@ -224,13 +231,14 @@ def sample(fit: Fit, *, likelihood: Likelihood | None = None, priors: Sequence[P
         raise ValueError(f"walkers {count} must be even and at least {max(2 * size, 8)}, ensembles {ensembles} and workers {workers} at "
                          f"least 1, "
                          f"block {block} at least 10, most {most} at least one block")
-    first, second, third = np.random.SeedSequence(seed).spawn(3)
+    first, second, third, fourth = np.random.SeedSequence(seed).spawn(4)
     middle = centres(target, starting_fits(fit, chosen))
-    starts = first_walkers(target, middle, count, first.spawn(ensembles))
+    around = neighbourhoods(target, middle)
+    starts = first_walkers(target, around, count, first.spawn(ensembles))
     generators = [seeded(child) for child in second.spawn(ensembles)]
     states = [Walkers(s, value, generator) for (s, value), generator in zip(starts, generators, strict=True)]
     kept = Checkpoints(Path(store), identity(target, starts, (seed, ensembles, count, block))) if store is not None else None
-    run = _Run(target, block, most, steps, third, kept, progress, stop)
+    run = _Run(target, block, most, steps, third, kept, progress, stop, mixture=first_proposal(target, around, fourth))
     with Crew(target, executor=executor, workers=min(workers, ensembles)) as crew:
         found = run.go(states, crew).posterior(seed)
     return with_known_optima(found, target, middle, seed)
@@ -251,7 +259,7 @@ class _Run:
     stop: Callable[[], bool] | None
     blocks: list[list[Block]] = field(default_factory=list)     # by block, then ensemble
     burn_blocks: int | None = None
-    mixture: Mixture | None = None
+    mixture: Proposal | None = None
     first_burn: int | None = None
     lessons: int = 0
     redrawn: int = 0
@@ -303,9 +311,7 @@ class _Run:
         tau = max(integrated_time(half[..., i]) for i in range(half.shape[-1]))
         if (done >= LEAST_BURN and done >= BURN_TIMES * tau) or done + self.block > longest:
             self.burn_blocks = len(self.blocks)
-        if self.burn_blocks is not None or len(self.blocks).bit_count() == 1:
-            # after 1, 2, 4, … blocks, and at the end of burn-in for all that is kept
-            self.mixture = learn_mixture(half.reshape(-1, half.shape[-1]), self.prune_seed)
+        self.mixture = self._learnt(half[:, half.shape[1] // 2 if len(self.blocks) == 1 else 0:])
         if self.burn_blocks is None and done < BURN_TIMES * tau / 2:   # walkers that are still on their way down are not lost
             return states
         last = self.blocks[-1]
@@ -339,9 +345,22 @@ class _Run:
         """A mixture learnt too early leaves part of the posterior to slow moves: what was drawn teaches a new one, and is dropped."""
         if self.first_burn is None:
             self.first_burn = self.burn_blocks or 0
-        draws = self._chain(self.first_burn)[0]
-        self.mixture = learn_mixture(draws.transpose(1, 0, 2, 3).reshape(-1, draws.shape[-1]), self.prune_seed)
+        self.mixture = None
+        self.mixture = self._learnt(self._chain(self.first_burn)[0])
         self.burn_blocks, self.next_check, self.lessons = len(self.blocks), 0, self.lessons + 1
+
+    def _learnt(self, draws: Array) -> Proposal | None:
+        """From draws (M, N, W, P), of all ensembles alike; what there is where that describes other walkers better than half of them can
+        teach."""
+        z = self.target.ridges.to_walk(draws.transpose(1, 2, 0, 3))
+        known, teaching, asked = (x.reshape(-1, z.shape[-1]) for x in (z, z[:, ::2], z[:, 1::2]))
+        found, half = learn_proposal(known, self.prune_seed), None
+        if self.mixture is not None:
+            half = learn_proposal(teaching, self.prune_seed)
+            asked = asked[::max(1, len(asked) // ASKED)]
+            if found is None or half is None or half.log_density(asked).mean() < self.mixture.log_density(asked).mean():
+                return self.mixture
+        return found
 
     def _assess(self, s: Array, value: Array, accepted: Array) -> Convergence:
         problem = self.target.problem

@@ -58,11 +58,15 @@ class Likelihood(ABC):
 
     def curvature(self, theta: NDArray[np.float64], coordinates: Coordinates) -> NDArray[np.float64]:
         """Information (P, P) of the recordings around theta (P,), in the given coordinates: here that of the residual of Eq. 13."""
-        slope = jacobian(self.problem, theta) * np.sqrt(self.weights)[:, None]
+        slope = self._slope(theta)
         stretch = coordinates.log_jacobian(coordinates.to_s(theta)) - self.problem.coordinates.log_jacobian(self.problem.to_s(theta))
         slope = slope * np.exp(stretch)
         slope = np.where(np.isfinite(slope), slope, 0.0)
         return np.asarray(slope.T @ slope)
+
+    def _slope(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative (n, P) of the weighted residual by the problem's search coordinates, in any entries of the same sums of squares."""
+        return jacobian(self.problem, theta) * np.sqrt(self.weights)[:, None]
 
 
 @final
@@ -97,6 +101,12 @@ class GaussianResidual:
         object.__setattr__(self, "offset", -0.5 * information * np.log(2 * np.pi * self.variance))
         condensed = condense(self.problem, self.weights) if tabled(self.problem) else None
         object.__setattr__(self, "_condensed", None if condensed is None else condensed.of(self.problem))
+
+    def slope(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative (n, P) of the weighted residual by the search coordinates of the problem."""
+        if self._condensed is not None:
+            return self._condensed.slope(theta)
+        return jacobian(self.problem, theta) * np.sqrt(self.weights)[:, None]
 
     def total(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """(W,) log-likelihood."""
@@ -214,6 +224,9 @@ class WhittleLikelihood(Likelihood):
         """(W,) of theta (W, P)."""
         return self._gaussian.total(_rows(theta))
 
+    def _slope(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._gaussian.slope(theta)
+
     def by_block(self, theta: ArrayLike) -> NDArray[np.float64]:
         """(W, B) of theta (W, P)."""
         return self._gaussian.by_block(_rows(theta))
@@ -264,6 +277,9 @@ class PlainLikelihood(Likelihood):
         """(W,) of theta (W, P)."""
         return self._gaussian.total(_rows(theta))
 
+    def _slope(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._gaussian.slope(theta)
+
     def by_block(self, theta: ArrayLike) -> NDArray[np.float64]:
         """(W, B) of theta (W, P)."""
         return self._gaussian.by_block(_rows(theta))
@@ -291,12 +307,15 @@ def _gaussian(problem: Problem, variance: NDArray[np.float64]) -> GaussianResidu
     return GaussianResidual(problem, variance, frequency_blocks(problem)[0])
 
 
-def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64],
-            coordinates: Coordinates | None = None) -> NDArray[np.float64]:
+def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64], coordinates: Coordinates | None = None,
+            turn: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Covariance (P, P) around theta: information of the likelihood plus that of the prior, 1/sd² (P,), so that it always exists.
 
-    In the given coordinates, None: those of the problem; ``prior_sd`` must be in the same.
+    In the given coordinates, None: those of the problem; or in others z, of whose derivatives ds/dz ``turn`` (P, P) consists. ``prior_sd``
+    must be in the same.
     """
     information = likelihood.curvature(theta, likelihood.problem.coordinates if coordinates is None else coordinates)
+    if turn is not None:
+        information = turn.T @ information @ turn
     values, vectors = np.linalg.eigh(information * np.outer(prior_sd, prior_sd))
     return (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T * np.outer(prior_sd, prior_sd)

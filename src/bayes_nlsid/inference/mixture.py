@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-FREEDOM = 8.0                     # of every t: tails heavier than those of the draws, so that no walker is left behind
+FREEDOM = 8.0                     # of every t, at least, and one for each parameter: tails heavier than those of the draws, so that no
+#                                   walker is left behind
 SIZES = (1, 2, 4, 8, 16, 32)      # numbers of components that are tried
 DRAWS_EACH = 3                    # draws for every number of the mixture, at least
-TAUGHT = 8000                     # draws used
+LOOKED_AT, TAUGHT = 40_000, 8000   # draws looked at, and used of those that differ
 ROUNDS = 40                       # of expectation and maximisation
 FLOOR = 1e-10                     # least variance of a component, relative to that of all draws, in every direction
 
@@ -56,6 +57,11 @@ class Mixture:
         if not (np.diagonal(self.roots, axis1=1, axis2=2) > 0).all():
             raise ValueError("a root is singular: the diagonals must be positive")
 
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of every component."""
+        return max(FREEDOM, float(self.means.shape[1]))
+
     @cached_property
     def _whitening(self) -> Array:
         return np.asarray(np.linalg.inv(self.roots), dtype=float)
@@ -68,13 +74,13 @@ class Mixture:
         """(n,) of s (n, P), up to a constant."""
         size = s.shape[1]
         z = np.einsum("kij,nkj->nki", self._whitening, s[:, None, :] - self.means)
-        each = self._level - 0.5 * (FREEDOM + size) * np.log1p(np.sum(z**2, axis=-1) / FREEDOM)
+        each = self._level - 0.5 * (self.freedom + size) * np.log1p(np.sum(z**2, axis=-1) / self.freedom)
         return np.asarray(np.logaddexp.reduce(each, axis=1))
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Independent draws (count, P)."""
         which = rng.choice(len(self.weights), size=count, p=self.weights)
-        tail = np.sqrt(rng.chisquare(FREEDOM, size=count) / FREEDOM)
+        tail = np.sqrt(rng.chisquare(self.freedom, size=count) / self.freedom)
         z = rng.normal(size=(count, self.means.shape[1])) / tail[:, None]
         return np.asarray(self.means[which] + np.einsum("nij,nj->ni", self.roots[which], z))
 
@@ -94,7 +100,8 @@ def learn_mixture(draws: Array, seed: np.random.SeedSequence) -> Mixture | None:
     Mixture or None
         None where there are too few draws for one component, or they do not move in some direction.
     """
-    taken = np.unique(draws[:: max(1, len(draws) // TAUGHT)], axis=0)    # a walker that stood still is no peak
+    taken = np.unique(draws[:: max(1, len(draws) // LOOKED_AT)], axis=0)    # a walker that stood still is no peak
+    taken = taken[np.random.default_rng(seed).permutation(len(taken))[:TAUGHT]]
     count, size = taken.shape
     centre = taken.mean(axis=0)
     spread = taken.std(axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.inference.likelihood import Likelihood
-from bayes_nlsid.inference.prior import Prior, check_priors, log_prior, sampling_coordinates
+from bayes_nlsid.inference.prior import Prior, check_priors, log_prior, sample_priors, sampling_coordinates
+from bayes_nlsid.inference.ridges import Ridges
 
 
 @final
@@ -45,6 +47,11 @@ class Target:
         """Bounds, coordinates and names."""
         return self.likelihood.problem
 
+    @cached_property
+    def ridges(self) -> Ridges:
+        """Coordinates in which walkers move."""
+        return Ridges(self.problem, self.coordinates)
+
     def to_s(self, theta: ArrayLike) -> NDArray[np.float64]:
         """Sampling coordinates (..., P)."""
         return self.coordinates.to_s(theta)
@@ -67,19 +74,32 @@ class Target:
         shares = (np.arange(512) + 0.5) / 512
         return self.to_s(np.stack([p.quantile(shares) for p in self.priors], axis=-1))
 
+    @property
+    def walk_sd(self) -> NDArray[np.float64]:
+        """Standard deviation (P,) of the prior in coordinates of the walk."""
+        if not self.ridges.joints:
+            return self.prior_sd
+        return self.ridges.to_walk(self.to_s(sample_priors(self.priors, 512, np.random.default_rng(0)))).std(axis=0)
+
     def parts(self, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Log density (W,) of s (W, P), and where the likelihood failed although the prior allows the point."""
         out = np.full(len(s), -np.inf)
         failed = np.zeros(len(s), dtype=bool)
-        inside = ((s >= self.box[0]) & (s <= self.box[1])).all(axis=1)
-        theta = self.to_theta(np.clip(s, *self.box))
-        prior = np.where(inside, log_prior(self.coordinates, self.priors, np.clip(s, *self.box), theta), -np.inf)
+        inside = ((s >= self.box[0]) & (s <= self.box[1])).all(axis=1)     # what is NaN is not
+        held = np.clip(np.where(np.isfinite(s), s, self.box[0]), *self.box)
+        theta = self.to_theta(held)
+        prior = np.where(inside, log_prior(self.coordinates, self.priors, held, theta), -np.inf)
         allowed = np.isfinite(prior)
         if allowed.any():
             value = self.likelihood.log_likelihood(theta[allowed])
             failed[allowed] = ~np.isfinite(value)
             out[allowed] = np.where(np.isfinite(value), prior[allowed] + value, -np.inf)
         return out, failed
+
+    def along(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log density (W,) in coordinates of the walk, z (W, P)."""
+        value = self(self.ridges.to_s(z))
+        return np.where(np.isfinite(value), value + self.ridges.log_jacobian(z), -np.inf)
 
     def __call__(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log density (W,) of s (W, P)."""
