@@ -135,6 +135,11 @@ class Case:
         """Names of the usable sensors."""
         return tuple(n for n, ok in zip(self.sensors, self.usable, strict=True) if ok)
 
+    @property
+    def loudest(self) -> CaseRecord:
+        """The open driven record of the highest level, a steady one if there is any."""
+        return max((r for r in self.records if not r.sealed and r.kind != "off"), key=lambda r: (r.kind == "steady", r.level))
+
     def select(self, kind: str, sealed: bool = False) -> tuple[CaseRecord, ...]:
         """Records of one kind, in the order of the test day."""
         return tuple(r for r in self.records if r.kind == kind and r.sealed == sealed)

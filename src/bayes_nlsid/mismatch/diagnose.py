@@ -96,11 +96,9 @@ def analyse(case: Case, say: Progress) -> Analysis:
     linear = not evidence.statistic > 1.1
     # a transfer function that a strong law has bent fits nothing well: its search does not depend on how well
     fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=6 if linear else 0 if evidence.strong else 2)
-    as_read = case
-    between = heard(spectra, fam, fit, case.band)
+    as_read, between = case, heard(spectra, fam, fit, case.band)
     if between is not None and between.real:
-        spectra = without(spectra, between)
-        evidence = gather(spectra, case.band, case.mains)
+        evidence = gather(without(spectra, between), case.band, case.mains)
     elif between is not None and (straight := straightened(case, spectra)) is not None:
         case = straight
         spectra, held, floor = _groups(without_hum(case, spectra), [])
@@ -123,8 +121,8 @@ def cell_fault(case: Case, between: Heard | None) -> list[Disturbance]:
     """Force that only the cell reads, as a disturbance as large as the response it should have had."""
     if between is None or between.real:
         return []
-    loudest = max((r for r in case.records if not r.sealed and r.kind != "off"), key=lambda r: r.level).accel[:, case.usable]
-    return [Disturbance("other", "FORCE", between.gain, between.size * float(np.sqrt(np.mean(loudest ** 2))), "curve of the force cell")]
+    rms = float(np.sqrt(np.mean(case.loudest.accel[:, case.usable] ** 2)))
+    return [Disturbance("other", "FORCE", between.gain, between.size * rms, "curve of the force cell")]
 
 
 def _groups(case: Case, notes: list[str]) -> tuple[Spectra, tuple[CaseRecord, ...], Array]:
@@ -181,7 +179,7 @@ def _mass_scale(case: Case) -> float:
 
 
 def _scores(evidence: Evidence, fit: LinearFit, found: Found, rivals: list[Rival], held_none: float) -> Scores:
-    items = tuple(Score(r.key, float(r.gain), float(r.alone), r.strength, r.visible, r.rest, r.held, r.faint, bool(r.extra) and not r.clip)
+    items = tuple(Score(r.key, float(r.gain), float(r.alone), r.strength, r.visible, r.rest, r.held, r.faint, r.incoherent)
                   for r in rivals)
     best = next((r.hypothesis for r in rivals if r.hypothesis is not None), None)
     total = evidence.values + fit.dof

@@ -71,6 +71,11 @@ class Rival:
     faint: bool = False
 
     @property
+    def incoherent(self) -> bool:
+        """Whether one of its effects is a disturbance that does not follow the shaker."""
+        return any(e.cls != "clipping" for e in self.extra)
+
+    @property
     def strength(self) -> float:
         """The smallest of its effects."""
         return min(self.strengths, default=float("nan"))
@@ -196,28 +201,26 @@ def _disturbed(found: list[Disturbance], rivals: list[Rival], case: Case) -> lis
     # the best single, whatever a pair of coherent effects gains beside it
     best = max((r for r in rivals if len(r.key) == 1), key=lambda r: r.gain, default=None)
     size = {d: _relative(case, d) for d in found}
+    effects = {d: Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",)) for d in found}
     for d in found:
         if d.cls not in known or d.gain < (FAINT_PLACE if d.cls == "other" else FAINT):
             continue
-        effect = Effect(d.cls, d.place, None, np.array([d.size]), ("rms",), ("m/s^2",))
-        out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effect,), (size[d],)))
+        out.append(Rival(((d.cls, d.place),), d.gain, 0.0, None, (), (effects[d],), (size[d],)))
         if best is not None and d in strong and best.gain > 25 and best.key[0] != (d.cls, d.place):
             key, sizes = _ordered([*best.key, (d.cls, d.place)], [*best.strengths, size[d]])
-            out.append(Rival(key, best.gain + d.gain, max(best.gain, d.gain), best.hypothesis, best.clip, (*best.extra, effect), sizes))
+            out.append(Rival(key, best.gain + d.gain, max(best.gain, d.gain), best.hypothesis, best.clip, (*best.extra, effects[d]), sizes))
     for i, a in enumerate(strong):
         for b in strong[i + 1:]:
             if a.cls != b.cls:
                 key, sizes = _ordered([(a.cls, a.place), (b.cls, b.place)], [size[a], size[b]])
-                out.append(Rival(key, a.gain + b.gain, max(a.gain, b.gain), strengths=sizes))
+                out.append(Rival(key, a.gain + b.gain, max(a.gain, b.gain), extra=(effects[a], effects[b]), strengths=sizes))
     return out
 
 
 def _relative(case: Case, d: Disturbance) -> float:
     """Size of a disturbance over the response at the highest level, of its channel or of all."""
-    driven = [r for r in case.records if not r.sealed and r.kind != "off"]
-    loudest = max(driven, key=lambda r: (r.kind == "steady", r.level)).accel
-    names = list(case.sensors)
-    rms = np.sqrt(np.mean(loudest[:, names.index(d.place)] ** 2) if d.place in names else np.mean(loudest[:, case.usable] ** 2))
+    names, accel = list(case.sensors), case.loudest.accel
+    rms = np.sqrt(np.mean(accel[:, names.index(d.place)] ** 2) if d.place in names else np.mean(accel[:, case.usable] ** 2))
     return float(d.size / max(float(rms), 1e-300))
 
 
