@@ -76,7 +76,7 @@ def _other_seconds(bench: Bench, pair: Hypothesis, most: int = 2) -> list[Hypoth
                       for D, time in zip(motions, day(evidence.spectra, evidence.spectra.starts), strict=True)])        # (R, L, 1)
     left = pair.residual - np.einsum("lsj,rlj->rls", h, np.moveaxis(evidence.project(np.moveaxis(force, 2, 0)), 0, 2))
     found, _, _ = scan_forces(fam, pair.fit, evidence, [second.place], left, paths, motions)
-    others = [c for c in found if c.effect.law is not None and c.effect.cls != second.cls and c.gain > 0.5 * found[0].gain]
+    others = [c for c in found if c.effect.law is not None and c.effect.key not in (kept.key, second.key) and c.gain > 0.5 * found[0].gain]
     return [refine(bench, begin(bench, pair.fit, (Candidate(kept, 0.0), c), steps=1), steps=4, quick=True) for c in others[:most]]
 
 
