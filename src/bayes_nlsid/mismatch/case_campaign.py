@@ -112,8 +112,8 @@ def campaign_from_case(path: str | Path) -> Campaign:
     records = _records(folder, meta, sensors, notes)
     fit = [r for r, use in records if use == "fit"]
     if not fit:
-        why = next((note for note in reversed(notes) if "left out" in note), "")
-        raise InputError(f"{folder / 'case.json'}: records", f"no open record could be used{why and f' ({why[:-1]})'}",
+        why = next((note.rstrip(".") for note in reversed(notes) if "left out" in note), "")
+        raise InputError(f"{folder / 'case.json'}: records", f"no open record could be used{why and f' ({why})'}",
                          "provide at least one record with time and accel, velocity or displacement")
     band = meta.get("band_hz")
     clock = min(r.fs for r in fit)

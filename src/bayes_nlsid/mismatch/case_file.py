@@ -40,9 +40,14 @@ def read_meta(path: Path) -> dict[str, Any]:
     for key, value in meta["tolerances"].items():
         if not (_number(value) and value > 0):
             raise InputError(f"{path}: tolerances.{key}", "is not a number above zero", "state it as a share of the value")
+    for key in ("locations", "geometry"):
+        if key in meta:
+            meta[key] = {name: value for name, value in under(meta, key).items() if value is not None}
     for key in ("sensors", "joints", "mass_points", "other"):
         if not _texts(under(meta, "locations").get(key, [])):
             raise InputError(f"{path}: locations.{key}", "is not a list of names", "list the names as texts")
+    if not isinstance(under(meta, "geometry").get("sensors", []), list):
+        raise InputError(f"{path}: geometry.sensors", "is not a list", "list the sensors, each with its name and place")
     meta["records"] = [_entry(entry, path) for entry in meta["records"]]
     return meta
 
@@ -88,7 +93,8 @@ _FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "excited_lines": (_lines, "a list of whole numbers from zero up"), "classes": (_texts, "a list of names"),
     "locations": (lambda value: isinstance(value, dict), "a table"), "tolerances": (lambda value: isinstance(value, dict), "a table")}
 _OF_A_RECORD: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "name": (_file_name, "the name of a file in the folder"), "level": (_number, "a number"), "start_s": (_number, "a number, s"),
+    "name": (_file_name, "the name of a file in the folder"), "level": (_positive, "a number from zero up"),
+    "start_s": (_number, "a number, s"),
     "kind": (lambda value: isinstance(value, str), "a text"), "sealed": (lambda value: isinstance(value, bool), "true or false")}
 
 
@@ -110,6 +116,6 @@ def load(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError(str(path), "file not found", "put it beside case.json")
     arrays = read_archive(path)
     for name, array in arrays.items():
-        if array.dtype.kind not in "fiubU":
+        if array.dtype.kind not in ("fiubU" if name.endswith("_names") else "fiub"):
             raise InputError(f"{path}: {name}", f"holds entries of type {array.dtype}", "store real numbers, and names as texts")
     return arrays

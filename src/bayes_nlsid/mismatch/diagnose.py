@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.mismatch.calibrate import LinearFit, calibrate
+from bayes_nlsid.mismatch.calibrate import LinearFit, calibrate, descend, finish
 from bayes_nlsid.mismatch.case import Case, CaseRecord, read_case
 from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.cell import Heard, heard, straightened, without
@@ -104,10 +104,12 @@ def analyse(case: Case, say: Progress) -> Analysis:
         spectra, held, floor = _groups(without_hum(case, spectra), [])
         evidence = gather(spectra, case.band, case.mains)
         fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=2)
+    others = () if linear else _one_level(fam, evidence)
+    fit = _cheapest(fam, fit, others) if evidence.strong else fit
     bench = _bench(case, fam, fit, evidence)
     say("searching laws, places and channels")
     places = list(fam.places)
-    found = search(bench, fit, places, case.band, say, () if linear else _one_level(fam, evidence))
+    found = search(bench, fit, places, case.band, say, others)
     fit = found.fit
     noisy = disturbances(case, raw if raw.kind == "steady" else None, fam, fit.fields.modes) + cell_fault(case, between)
     rivals = all_rivals(case, bench, fit, found, floor, noisy, say)
@@ -169,6 +171,14 @@ def _one_level(fam: Family, evidence: Evidence) -> tuple[LinearFit, ...]:
     found = [level_transfer(evidence), (evidence.H, evidence.doubted(evidence.residual))]
     restarts = 1 if evidence.strong else 4
     return tuple(calibrate(fam, evidence.spectra.s[evidence.excited], *f, restarts=restarts) for f in found if f is not None)
+
+
+def _cheapest(fam: Family, fit: LinearFit, others: tuple[LinearFit, ...]) -> LinearFit:
+    """The calibration, or what it becomes from where another one ended: one of a bent transfer function is not begun from many starts."""
+    for other in others:
+        theta, _, _ = descend(fam, other.theta, fit.s, fit.measured, fit.variance, 25, tol=0.05)
+        fit = min(fit, finish(fam, theta, fit.s, fit.measured, fit.variance, status=fit.status), key=lambda f: f.cost)
+    return fit
 
 
 def _mass_scale(case: Case) -> float:

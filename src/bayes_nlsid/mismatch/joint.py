@@ -139,7 +139,7 @@ def refine(bench: Bench, h: Hypothesis, steps: int = 5, quick: bool = False, dou
     Parameters
     ----------
     quick : of what linear parameters do to the motion at the place, only the stiffness there counts in the derivatives, which saves most
-        simulations, and marches take their longest steps.
+        simulations, and marches take longer steps.
     doubt : the transfer function counts as far as it is not bent by what ``h`` leaves unexplained; what comes back may cost more.
     """
     if not h.forces:

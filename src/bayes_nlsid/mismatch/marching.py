@@ -40,7 +40,7 @@ def march_laws(paths: Bed, record: int, laws: tuple[LawAlong, ...], start: Compl
         lost = march_modes(q0, v0, steps.own, steps.forced, steps.b, steps.yielding, paths.dt / paths.marched, codes, powers, values, g,
                            state, before)
         if paths.marched < FINEST and _rings(g):
-            return march_laws(replace(paths, marched=4 * paths.marched), record, laws, start, passes)
+            return march_laws(replace(paths, marched=min(4 * paths.marched, FINEST)), record, laws, start, passes)
         if not np.abs(g).max() < HUGE:
             return linear, np.zeros_like(linear), False
         G = np.asarray(np.fft.rfft(g * decay[:, None], axis=0, norm="forward")[:len(paths.s)])

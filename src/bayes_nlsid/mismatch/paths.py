@@ -118,10 +118,11 @@ class Bed:
         high = self.rows[:, ~low] / self.modes.omega[~low]
         own, forced = propagators(self.modes.omega[low], self.modes.zeta[low], dt)
         # a force that is linear within a step has less of each frequency than the force itself: near its own a mode would feel it
-        forced = forced * np.where(self.modes.omega[low] * dt < RESONANT, np.sinc(self.modes.omega[low] * dt / (2 * np.pi)) ** -2.0, 1.0)
+        more = np.where(self.modes.omega[low] * dt < RESONANT, np.sinc(self.modes.omega[low] * dt / (2 * np.pi)) ** -2.0, 1.0)
+        forced, slow = forced * more, self.rows[:, low] * np.sqrt(more - 1.0) / self.modes.omega[low]    # far below it, it gets no more
         back = _steady(own, forced, np.exp(self.s * dt)) if self.periodic else np.zeros((2, 0, 0), dtype=complex)
         fading = np.maximum(self.modes.zeta[low] * self.modes.omega[low] * self.samples * self.dt, 1e-12)
-        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T, back, -np.expm1(-fading) / fading)
+        return Steps(own, forced, np.ascontiguousarray(self.rows[:, low]), high @ high.T - slow @ slow.T, back, -np.expm1(-fading) / fading)
 
     def linear(self, record: int) -> Complex:
         """(K, J): motion without any law."""

@@ -3,20 +3,20 @@
 A law that changes the response by a tenth or more moves its place otherwise than any linear model without it, and bends the mean transfer
 function on which that model is calibrated; a search that begins there may never reach it. But to the force of each level the structure
 answers nearly as a linear one would, with another dynamic stiffness k + c s at the place of the law (equivalent linearization, Caughey
-1963). Such a fit, all levels with one linear model, has no side valleys worth the name. The place that needs least of it is that of the
+1963). Such a fit, all levels with one linear model, has no side valleys worth the name. The place that explains most so is that of the
 law; how k and c go with the level tells which law, and how strong.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import Extension, LinearFit, assemble, finish, floored
-from bayes_nlsid.mismatch.catalogue import CATALOGUE
+from bayes_nlsid.mismatch.catalogue import ROWS
 from bayes_nlsid.mismatch.effects import Effect, along_period
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.explain import Candidate
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Level = tuple[NDArray[np.intp], Complex, Array]
 TOLERANCE = 0.1   # of a transfer function that is only nearly linear, relative
-SAME = 0.02       # difference of levels (log) that are taken as one
+SAME = 0.1        # difference of forces (log rms) that are taken as one level
 WIDE = 30.0       # prior sd of an equivalent stiffness over the static one of the place, and of damping at mid band
 EVERY = 3         # lines of which one is used
 INEXACT = 0.05    # of an equivalent stiffness as the statement of a law, over the largest
@@ -69,14 +69,18 @@ class Equivalent:
 def by_level(evidence: Evidence) -> list[Level]:
     """Records, transfer function (Le, S) and its variance for each level."""
     spectra, e = evidence.spectra, evidence.excited
-    mark = np.round(np.log(spectra.levels / spectra.levels.max()) / SAME)
+    size = np.linalg.norm(spectra.waveforms, axis=1)
+    mark = np.round(np.log(np.maximum(size / max(float(size.max()), 1e-300), 1e-9)) / SAME)
+    F = spectra.force[:, e]
+    Y = F[:, :, None] * evidence.H + evidence.residual[:, e]    # not the responses: what was undone stays undone
     out = []
     for level in np.unique(mark):
         records = np.flatnonzero(mark == level)
-        F, Y, trust = spectra.force[records][:, e], spectra.response[records][:, e], evidence.trust[records]
-        power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)
-        H = np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power[:, None]
-        out.append((records, H, spectra.noise[records][:, e].mean(0) / power[:, None] + (TOLERANCE * np.abs(H)) ** 2))
+        trust = evidence.trust[records]
+        power = np.einsum("r,rl->l", trust, np.abs(F[records]) ** 2)[:, None]
+        H = np.einsum("r,rl,rls->ls", trust, F[records].conj(), Y[records]) / power
+        noise = np.einsum("r,rls->ls", trust, spectra.noise[records][:, e]) / len(records)
+        out.append((records, H, noise / power + (TOLERANCE * np.abs(H)) ** 2))
     return out
 
 
@@ -132,18 +136,20 @@ def _laws_at(bench: Bench, found: Equivalent) -> list[Hypothesis]:
     fam, spectra = bench.family, bench.evidence.spectra
     paths = bed(_linear(bench, found.theta).fields.modes, spectra, fam.places[found.place][None], fam.shaker)
     moved = [_motion(paths, int(records[0]), k + c * paths.s) for records, (k, c) in zip(found.groups, found.values, strict=True)]
-    size = _largest(moved)
+    size, movable = _largest(moved), _own_stiffness(bench, found.place) > 0
     best: list[tuple[float, Candidate, float]] = []
-    for row in CATALOGUE:
+    for row in ROWS.values():
         if row.kind == "force":
-            each = [_matched(law, law.shapes(size), moved, paths, found, row.name) for law in row.laws]
-            best.append(min(each, key=lambda m: m[0]))
-    least = min(m[0] for m in best)
+            each = [_matched(law, law.shapes(size), moved, paths, found, row.name, movable) for law in row.laws]
+            acting = [m for m, law in zip(each, row.laws, strict=True) if m[1].effect.values[law.scaled[0]] != 0]
+            best += sorted(acting, key=lambda m: m[0])[:1]
+    least = min((m[0] for m in best), default=0.0)
     out = []
     for misfit, candidate, offset in sorted(best, key=lambda m: m[0]):
         if misfit < ALIKE * max(least, 1.0):
             start = _linear(bench, _stiffened(bench, found, offset))
-            out.append(begin(bench, start, (candidate,), steps=0, weaker=0))
+            both = (candidate, _mirrored(candidate)) if candidate.effect.cls == "asymmetric" else (candidate,)
+            out.append(min((begin(bench, start, (c,), steps=0, weaker=0) for c in both), key=lambda h: h.misfit_records))
     return out
 
 
@@ -165,10 +171,10 @@ def _largest(moved: list[tuple[Array, Array]]) -> Size:
     return Size(max(float(np.std(d)), 1e-30), max(float(np.std(v)), 1e-30), max(float(np.abs(d).max()), 1e-30))
 
 
-def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: Bed, found: Equivalent, cls: str
-             ) -> tuple[float, Candidate, float]:
+def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: Bed, found: Equivalent, cls: str,
+             movable: bool) -> tuple[float, Candidate, float]:
     """The shape and factor of a law whose equivalents are nearest to those found: mean squared deviation, the law, and the stiffness that
-    belongs to the linear model beside it."""
+    belongs to the linear model beside it (0 unless that is ``movable`` at the place)."""
     along = [along_period(law, shapes, d, v, paths.dt, paths.periodic) for d, v in moved]                         # (K, n) each
     own = np.array([[g @ d / (d @ d), g @ v / (v @ v)] for g, (d, v) in zip(along, moved, strict=True)])          # (Q, 2, K)
     rate = float(np.mean([np.std(v) / np.std(d) for d, v in moved]))
@@ -176,9 +182,10 @@ def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: B
     wanted = found.values.ravel() * scale
     doubt = found.covariance * np.outer(scale, scale) + np.diag(np.full(len(wanted), (INEXACT * np.abs(wanted).max()) ** 2 + 1e-300))
     root = np.linalg.inv(np.linalg.cholesky(doubt))
-    offset, target = root @ np.tile([1.0, 0.0], len(moved)), root @ wanted
+    offset, target = root @ np.tile([1.0, 0.0], len(moved)) * movable, root @ wanted
     columns = root @ (own.reshape(len(wanted), -1) * scale[:, None])                                              # (2 Q, K)
-    free = np.eye(len(target)) - np.outer(offset, offset) / (offset @ offset)
+    length = max(float(offset @ offset), 1e-300)
+    free = np.eye(len(target)) - np.outer(offset, offset) / length
     columns_left, target_left = free @ columns, free @ target
     factor = target_left @ columns_left / np.maximum((columns_left ** 2).sum(0), 1e-300)
     if not law.signed:
@@ -189,16 +196,28 @@ def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: B
     values[list(law.scaled)] *= factor[k]
     params = law.term.params
     effect = Effect(cls, found.place, law, values, tuple(p.name for p in params), tuple(p.unit for p in params))
-    return float(misfit[k]), Candidate(effect, 0.0), float(offset @ (target - columns[:, k] * factor[k]) / (offset @ offset))
+    return float(misfit[k]), Candidate(effect, 0.0), float(offset @ (target - columns[:, k] * factor[k]) / length)
+
+
+def _mirrored(candidate: Candidate) -> Candidate:
+    """The same one-sided law on the other side, which has the same equivalents."""
+    effect = candidate.effect
+    assert effect.law is not None
+    turned = np.array([-1.0 if kind in ("signed", "linear") else 1.0 for kind in effect.law.free])
+    return replace(candidate, effect=replace(effect, values=effect.values * turned))
+
+
+def _own_stiffness(bench: Bench, place: str) -> float:
+    """Stiffness of the part of the linear model that acts at a place and nowhere else, N/m; 0 if there is none."""
+    b = bench.family.single.get(bench.family.names.index(place)) if place in bench.family.names else None
+    direction = bench.family.places[place]
+    return 0.0 if b is None else float(b @ b) / float(direction @ direction)
 
 
 def _stiffened(bench: Bench, found: Equivalent, offset: float) -> Array:
     """The linear model with the stiffness at the place that is no part of the law."""
-    fam, theta = bench.family, found.theta.copy()
-    if found.place in fam.names:
-        i = fam.names.index(found.place)
-        b, direction = fam.single.get(i), fam.places[found.place]
-        if b is not None:
-            own = float(b @ b) / float(direction @ direction)
-            theta[i] = float(np.log(max(np.exp(theta[i]) + offset / own, 0.05)))
+    theta, own = found.theta.copy(), _own_stiffness(bench, found.place)
+    if own > 0:
+        i = bench.family.names.index(found.place)
+        theta[i] = float(np.log(max(np.exp(theta[i]) + offset / own, 0.05)))
     return theta

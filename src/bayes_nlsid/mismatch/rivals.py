@@ -240,11 +240,11 @@ def on_trial(case: Case, bench: Bench, fit: LinearFit, rivals: list[Rival], held
 
     none = error(fit, None, ())
     known: dict[int, float] = {id(None): none}
-    least = IN_VIEW * max((r.gain for r in rivals), default=0.0)
+    most = max((r.gain for r in rivals), default=0.0)
     out = []
     for r in rivals:
         mark = id(r.hypothesis)
-        if mark not in known and len(known) <= TRIED and r.gain >= least:
+        if mark not in known and len(known) <= TRIED and (r.gain == most or r.gain >= IN_VIEW * most):
             known[mark] = error(r.hypothesis.fit, r.hypothesis, r.clip) if r.hypothesis is not None else none
         out.append(replace(r, held=known.get(mark, float("nan"))))
     return out, none

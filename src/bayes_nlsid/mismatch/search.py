@@ -69,7 +69,7 @@ def search(bench: Bench, fit: LinearFit, places: list[str], band: tuple[float, f
     short = [] if hopeless else _short_forces(forces, top_linear)
     say(f"estimating {len(short)} laws jointly")
     begun = [_begun(bench, c, (starts[c.effect.key], *others[:1])) for c in short]
-    if short and bench.evidence.strong:
+    if bench.evidence.strong:
         begun += strong_starts(bench, (fit, *others)[-1].theta)
     singles = _pursued(bench, begun)
     # a law that explains more than any linear effect could makes those superfluous as first effects
