@@ -12,7 +12,7 @@ from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.fit import fit
 from bayes_nlsid.identification.problem import Problem
 from bayes_nlsid.identification.scenario import scenario
-from bayes_nlsid.identification.table import build, kind_of
+from bayes_nlsid.identification.table import build, kind_of, kink_of
 from bayes_nlsid.model import Element, Model
 from bayes_nlsid.structure.modal import ModalData, ModalModel
 
@@ -81,3 +81,29 @@ def test_fit_with_a_table_ends_where_the_exact_one_does_and_says_what_it_is_wort
 def test_too_few_places_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 8"):
         build(lambda term, p: np.zeros((len(p), 4)), "none", "odd", 1.0, 5)
+
+
+KINKS = [("iwan4", [2.0, 1e4, -0.5, 0.1], 2.0 * 1.1 / (1e4 * (0.1 + 1 / 3))), ("jenkins", [3.0, 1e4], 3e-4),
+         ("clearance", [1e4, 1.1e-3], 5.5e-4), ("iwan4", [50.0, 1e4, -0.5, 0.1], 0.0), ("mine", [1e4, 4e-4], 0.0)]
+
+
+@pytest.mark.parametrize(("term", "p", "kink"), KINKS)
+def test_kinks_are_found_where_they_are_and_nowhere_else(term: str, p: list[float], kink: float) -> None:
+    law = problem(term, 0).model.elements[0].term
+    assert kink_of(law, np.array(p), 1e-3) == pytest.approx(kink, rel=2e-3)
+
+
+@pytest.mark.parametrize("term", ["iwan4", "iwan4_memory", "jenkins"])
+def test_places_close_around_a_kink_meet_laws_near_it_better(term: str) -> None:
+    exact, plain = problem(term, 0), problem(term, 128)
+    centre = {"jenkins": [3.0, 1e4]}.get(term, [2.0, 1e4, -0.5, 0.1])
+    theta = exact.model.start(centre)
+    near = np.repeat(theta[None], 12, axis=0)
+    near[:, 2:4] *= 1 + 0.005 * np.random.default_rng(0).normal(size=(12, 2))
+    sharp = plain.with_kinks(theta)
+    assert sharp.kinks and sharp is not plain and not plain.kinks
+    expected = exact.nonlinear_force(near)
+    before, after = (np.sqrt(np.mean((one.nonlinear_force(near) - expected) ** 2)) for one in (plain, sharp))
+    assert after < 0.3 * before
+    smooth = problem("mine", 128)
+    assert smooth.with_kinks(smooth.model.start([1e4, 4e-4])) is smooth

@@ -68,7 +68,8 @@ class Regression:
         piece, seen = self.problem.pieces[index], self.problem.observed
         if self.root is None:
             return law_values(self.problem, piece, values) @ self.matrices[index].T
-        return self.root * seen.force(piece.element.term, piece.locations, values, piece.element.excess, self.problem.places)
+        return self.root * seen.force(piece.element.term, piece.locations, values, piece.element.excess, self.problem.places,
+                                      self.problem.kink(piece))
 
     def jacobian(self, s: Array, low: Array, high: Array) -> Array:
         """Derivative (B, n, K) of ``forces`` by the nonlinear search coordinates of s (B, P); steps inside the box, one piece at a time."""
@@ -160,7 +161,8 @@ class Condensed:
 def law_values(problem: Problem, piece: Piece, values: Array) -> Array:
     """Values (..., M) of a piece's law that multiply its columns, for parameters of the term (..., n_p)."""
     term, seen = piece.element.term, problem.observed
-    out = [seen.tables(part)[0][0].values(term, values) for part in seen.parts(term, piece.locations, problem.places, True)]
+    parts = seen.parts(term, piece.locations, problem.places, True, problem.kink(piece))
+    out = [seen.tables(part)[0][0].values(term, values) for part in parts]
     if piece.element.excess and term.stiffness is not None:
         out.append(-np.asarray(term.stiffness(*np.moveaxis(values, -1, 0)), dtype=float)[..., None])
     return np.concatenate(out, axis=-1)
@@ -291,16 +293,38 @@ class _Columns:
         return triangle
 
     def product(self, root: Array) -> Array:
-        """A factor from the eigenvectors of the product of the columns with themselves."""
+        """Triangle from the eigenvectors of the product of the columns with themselves.
+
+        What equations share, the motion at the joints, is multiplied once, under the sum of their weights.
+        """
         total = np.zeros((self.width, self.width))
-        for cell in self.problem.cells:
-            block = root[cell.entries, None] * self.block(cell)
-            total += block.T @ block
+        for record in range(len(self.problem.data)):
+            cells = [cell for cell in self.problem.cells if cell.record == record]
+            weights = np.stack([root[cell.entries] ** 2 for cell in cells])
+            vectors: dict[Hashable, Array] = {}
+            factors: dict[Hashable, Array] = {}
+            place: dict[Hashable, slice] = {}
+            for c, cell in enumerate(cells):
+                for label, parts in self.atoms(cell).items():
+                    first, width = self.labels[label]
+                    for name, factor, columns in parts:
+                        vectors[name], place[name] = columns, slice(first, first + width)
+                        factors.setdefault(name, np.zeros(len(cells)))[c] += factor
+            names = list(vectors)
+            for i, one in enumerate(names):
+                for other in names[i:]:
+                    shared = factors[one] * factors[other]
+                    if shared.any():
+                        narrow, wide = sorted((one, other), key=lambda name: vectors[name].shape[1])
+                        block = ((shared @ weights)[:, None] * vectors[narrow]).T @ vectors[wide]
+                        total[place[narrow], place[wide]] += block
+                        if one != other:
+                            total[place[wide], place[narrow]] += block.T
         norms = np.sqrt(np.diagonal(total))
         norms = np.where(norms > 0, norms, 1.0)
-        values, vectors = np.linalg.eigh(total / np.outer(norms, norms))
+        values, eigen = np.linalg.eigh(total / np.outer(norms, norms))
         kept = values > 1e-15 * values[-1]
-        return np.sqrt(values[kept])[:, None] * vectors[:, kept].T * norms
+        return _triangle(np.sqrt(values[kept])[:, None] * eigen[:, kept].T * norms)
 
     def factored_by_record(self, root: Array) -> Array:
         """As ``factored`` where every cell has one weight: what cells share is factored once."""
@@ -365,7 +389,7 @@ def _linear_vectors(problem: Problem) -> dict[Hashable, Array]:
 
 def _law_labels(problem: Problem, piece: Piece) -> list[Hashable]:
     term = piece.element.term
-    labels: list[Hashable] = list(problem.observed.parts(term, piece.locations, problem.places, True))
+    labels: list[Hashable] = list(problem.observed.parts(term, piece.locations, problem.places, True, problem.kink(piece)))
     return [*labels, ("stuck", piece.locations)] if piece.element.excess and term.stiffness is not None else labels
 
 

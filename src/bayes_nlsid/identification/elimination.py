@@ -172,6 +172,7 @@ def nonlinear_jacobian(problem: Problem, s: NDArray[np.float64], low: NDArray[np
         rows = np.repeat(s[None], len(columns) + 1, axis=0)
         rows[np.arange(1, len(columns) + 1), columns] += move
         values = piece.values(problem.to_theta(rows))
-        force = problem.observed.force(piece.element.term, piece.locations, values, piece.element.excess, problem.places)
+        force = problem.observed.force(piece.element.term, piece.locations, values, piece.element.excess, problem.places,
+                                         problem.kink(piece))
         out[:, columns] = ((force[1:] - force[0]) / move[:, None]).T
     return out

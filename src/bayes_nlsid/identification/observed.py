@@ -38,13 +38,14 @@ class Cell:
 @final
 @dataclass(frozen=True)
 class Part:
-    """Which table: of which locations, how many places, in displacement or in velocity."""
+    """Which table: of which locations, how many places, in displacement or in velocity, closer around which displacement (0: none)."""
 
     locations: tuple[str, ...]
     memory: Memory
     symmetry: Symmetry
     places: int
     rate: bool
+    kink: float = 0.0
 
 
 @final
@@ -200,12 +201,14 @@ class Observed:
         force = force_along(term, path, p, excess)
         return force[..., part] if memory else force
 
-    def force(self, term: Term, locations: Sequence[str], p: ArrayLike, excess: bool, places: int = 0) -> NDArray[np.float64]:
+    def force(self, term: Term, locations: Sequence[str], p: ArrayLike, excess: bool, places: int = 0,
+              kink: float = 0.0) -> NDArray[np.float64]:
         """In-band contribution (..., N) of a term to the residual, Σ b_l f(q_l, v_l; p) over locations that share p (..., n_p).
 
         With ``places`` the law is interpolated between so many displacements where it allows that (see ``table``); 0 is exact.
+        Around a ``kink`` (m) they stand closer.
         """
-        parts = self.parts(term, locations, places)
+        parts = self.parts(term, locations, places, kink=kink)
         if not parts:
             return np.asarray(sum(self._exact_force(term, name, p, excess) for name in locations))
         values = np.asarray(p, dtype=float)
@@ -219,7 +222,7 @@ class Observed:
             out -= stiffness[..., None] * self.stuck(locations)
         return out
 
-    def parts(self, term: Term, locations: Sequence[str], places: int, rough: bool = False) -> tuple[Part, ...]:
+    def parts(self, term: Term, locations: Sequence[str], places: int, rough: bool = False, kink: float = 0.0) -> tuple[Part, ...]:
         """Tables that hold the force of a term at locations with common parameters; none if it must be evaluated along the recordings.
 
         ``rough``: jumps may be blurred.
@@ -230,7 +233,7 @@ class Observed:
         group = tuple(locations)
         if kind == "sum":
             return Part(group, "none", "odd", places, False), Part(group, "none", "odd", places, True)
-        return (Part(group, term.memory, kind, places, False),)
+        return (Part(group, term.memory, kind, places, False, kink),)
 
     def tables(self, part: Part) -> tuple[tuple[ForceTable, ...], ...]:
         """One table for each location and recording, worked out when first asked for."""
@@ -241,7 +244,7 @@ class Observed:
 
             def table(record: int, name: str) -> ForceTable:
                 return build(lambda law, x: self._transform_of(law, record, name, x, False), part.memory, part.symmetry, reach, part.places,
-                             part.rate)
+                             part.rate, part.kink)
 
             self._tables[part] = tuple(tuple(table(r, name) for r in range(len(self.data))) for name in part.locations)
         return self._tables[part]

@@ -14,6 +14,7 @@ from bayes_nlsid.identification.bounds import FREQUENCY, bounds
 from bayes_nlsid.identification.coordinates import Coordinates
 from bayes_nlsid.identification.observed import Cell, Observed
 from bayes_nlsid.identification.scenario import Scenario
+from bayes_nlsid.identification.table import kink_of
 from bayes_nlsid.model import Element, Model
 from bayes_nlsid.structure.modal import ModalData
 
@@ -61,6 +62,8 @@ class Problem:
         Fraction of a transient under cosine edges; steady periods are never tapered.
     places : int
         Displacements between which force laws are interpolated (see ``table``), 0 for none: each evaluation then walks through all samples.
+    kinks : dict
+        Displacement (m) around which places stand closer, by term and locations; see ``with_kinks``.
     observed : Observed or None
         Prepared recordings to share between problems that differ in their elements only.
 
@@ -87,6 +90,7 @@ class Problem:
     c: float = 1.0
     taper: float = 0.1
     places: int = 0
+    kinks: dict[tuple[str, tuple[str, ...]], float] = field(default_factory=dict, repr=False)
     observed: Observed = field(default=None, repr=False)  # type: ignore[assignment]
     bounds: NDArray[np.float64] = field(init=False, repr=False)
     coordinates: Coordinates = field(init=False, repr=False)
@@ -178,7 +182,7 @@ class Problem:
 
     def _piece_force(self, piece: Piece, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         values = piece.values(theta)
-        return self.observed.force(piece.element.term, piece.locations, values, piece.element.excess, self.places)
+        return self.observed.force(piece.element.term, piece.locations, values, piece.element.excess, self.places, self.kink(piece))
 
     # -- the residual ------------------------------------------------------------------------------------------------------------
 
@@ -346,6 +350,19 @@ class Problem:
         low, high = self.to_s(self.bounds[:, 0]), self.to_s(self.bounds[:, 1])
         position = (self.to_s(self._checked(theta)) - low) / (high - low)
         return tuple(name for name, x in zip(self.names, position, strict=True) if not fraction < x < 1 - fraction)
+
+    def kink(self, piece: Piece) -> float:
+        """Where places of a piece's table stand closer, m; 0 for nowhere."""
+        return self.kinks.get((piece.element.term.name, piece.locations), 0.0)
+
+    def with_kinks(self, theta: NDArray[np.float64]) -> Problem:
+        """The same with tables that stand closest where the laws bend sharply at theta (P,): for what stays near it."""
+        found = {}
+        for piece in self.pieces:
+            reach = max(self.observed.peak(name)[0] for name in piece.locations)
+            if self.places and (at := kink_of(piece.element.term, piece.values(theta), reach)):
+                found[piece.element.term.name, piece.locations] = at
+        return replace(self, kinks=found) if found else self
 
     def with_elements(self, elements: Sequence[Element]) -> Problem:
         """The same recordings and linear part with other elements; the transformed recordings are shared."""

@@ -7,7 +7,7 @@ f(q) + h(v) needs a second such matrix between M velocities.
 
 Places stand at q_max (m/(M−1))², so that laws with a root at zero are met exactly, and values between them are interpolated by
 cubics through four neighbours. Smooth laws are then met to about 1e-7 of their largest force with 200 places; a kink (slip, gap)
-is blurred over one interval.
+is blurred over one interval. Where a fit has told where the kink is, part of the places stand close around it.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ Symmetry = Literal["odd", "even"]
 Kind = Literal["odd", "even", "sum"]
 """Of what a table can hold: odd or even in displacement alone, or a sum of a law odd in displacement and one odd in velocity."""
 ROWS = 64   # places of the table worked out at a time
+FINE, NEAR = 40, 0.05     # places around a kink whose position is known, and how far they reach, relative
+PROBED, SHARP = 4001, 20.0   # displacements at which a law is searched for a kink; change of its slope there, beside that around it
 
 
 @final
@@ -110,7 +112,7 @@ def _jumps(term: Term, p: NDArray[np.float64], reach: float, rate: bool) -> bool
 
 
 def build(transform: Callable[[Term, NDArray[np.float64]], NDArray[np.float64]], memory: Memory, symmetry: Symmetry, reach: float,
-          count: int, rate: bool = False) -> ForceTable:
+          count: int, rate: bool = False, kink: float = 0.0) -> ForceTable:
     """Work the table out.
 
     Parameters
@@ -125,6 +127,8 @@ def build(transform: Callable[[Term, NDArray[np.float64]], NDArray[np.float64]],
         Number M of places, at least 8.
     rate : bool
         Between velocities instead of displacements.
+    kink : float
+        Around which places stand close, 0 for none.
 
     Raises
     ------
@@ -134,25 +138,49 @@ def build(transform: Callable[[Term, NDArray[np.float64]], NDArray[np.float64]],
     if count < 8:
         raise ValueError(f"a force table needs at least 8 places, got {count}")
     top = reach * (1 + 1e-9) if reach > 0 else 1.0
-    places = top * (np.arange(count) / (count - 1)) ** 2
-    unit = _interpolation(memory, symmetry, top, count, rate)
+    roots = _spread(count, np.sqrt(kink / top) if 0 < kink < top else 0.0)
+    places = top * roots**2
+    unit = _interpolation(memory, symmetry, top, roots, rate)
     numbers = np.arange(count, dtype=float)[:, None]
     matrix = np.concatenate([transform(unit, numbers[i:i + ROWS]) for i in range(0, count, ROWS)])
     return ForceTable(places, np.ascontiguousarray(matrix.T), rate)
 
 
-def _interpolation(memory: Memory, symmetry: Symmetry, top: float, count: int, rate: bool) -> Term:
+def _spread(count: int, kink: float) -> NDArray[np.float64]:
+    """Square roots (M,) of the places relative to the largest, closer around that of a kink; 0 for none."""
+    if not kink:
+        return np.arange(count) / (count - 1)
+    low, high = kink * (1 - 0.5 * NEAR), min(1.0, kink * (1 + 0.5 * NEAR))
+    wide = np.linspace(0.0, 1.0, count - min(FINE, count // 2))
+    wide = wide[(wide < low) | (wide > high)]
+    return np.sort(np.concatenate([wide, np.linspace(low, high, count - len(wide))]))
+
+
+def kink_of(term: Term, p: NDArray[np.float64], reach: float) -> float:
+    """Displacement (m) within reach at which the slope of a law jumps for parameters p (n_p,); 0 where there is none."""
+    q = reach * np.linspace(0.02, 1.0, PROBED)
+    with np.errstate(all="ignore"):
+        jump = np.abs(np.diff(np.diff(term.static_force(q, np.zeros(1), p))))
+    if not np.isfinite(jump).all() or not jump.any():
+        return 0.0
+    k = int(np.argmax(jump))
+    around = np.r_[jump[max(0, k - 40):max(0, k - 3)], jump[k + 4:k + 41]]
+    return float(q[k + 1]) if 40 < k < len(jump) - 40 and jump[k] > SHARP * np.max(around) else 0.0
+
+
+def _interpolation(memory: Memory, symmetry: Symmetry, top: float, roots: NDArray[np.float64], rate: bool) -> Term:
     """The law whose only parameter is the number of a place: what one newton there gives at any displacement (or velocity)."""
+    count = len(roots)
 
     def law(q: Any, v: Any, place: Any) -> Any:
         x = v if rate else q
-        position = np.sqrt(np.minimum(np.abs(x) / top, 1.0)) * (count - 1)
-        first = np.clip(np.floor(position) - 1, 0, count - 4)
-        inside, own = position - first, place - first
-        weight = np.zeros(np.broadcast_shapes(np.shape(position), np.shape(own)))
+        at = np.sqrt(np.minimum(np.abs(x) / top, 1.0))
+        first = np.clip(np.searchsorted(roots, at, side="right") - 2, 0, count - 4)
+        own = place - first
+        weight = np.zeros(np.broadcast_shapes(np.shape(at), np.shape(own)))
         for k in range(4):
-            others = [j for j in range(4) if j != k]
-            cubic = np.prod([(inside - j) / (k - j) for j in others], axis=0)
+            mine = roots[first + k]
+            cubic = np.prod([(at - roots[first + j]) / (mine - roots[first + j]) for j in range(4) if j != k], axis=0)
             weight = np.where(own == k, cubic, weight)
         return np.sign(x) * weight if symmetry == "odd" else weight
 

@@ -198,7 +198,7 @@ class WhittleLikelihood(Likelihood):
             current = again if np.isfinite(again.mse) else current
         self.width = width
         self.fit = current
-        self._gaussian = _gaussian(problem, whittle_variance(problem, current.theta, width))
+        self._gaussian = _gaussian(problem, whittle_variance(problem, current.theta, width), current.theta)
 
     @property
     def problem(self) -> Problem:
@@ -256,7 +256,7 @@ class PlainLikelihood(Likelihood):
         for cell in start.problem.cells:
             variance[cell.entries] = np.mean(residual[cell.entries] ** 2)
         self.fit = start
-        self._gaussian = _gaussian(start.problem, variance * _spent(start.problem))
+        self._gaussian = _gaussian(start.problem, variance * _spent(start.problem), start.theta)
 
     @property
     def problem(self) -> Problem:
@@ -303,8 +303,8 @@ def _spent(problem: Problem) -> float:
     return problem.size / max(1.0, problem.size - len(problem.names))
 
 
-def _gaussian(problem: Problem, variance: NDArray[np.float64]) -> GaussianResidual:
-    return GaussianResidual(problem, variance, frequency_blocks(problem)[0])
+def _gaussian(problem: Problem, variance: NDArray[np.float64], theta: NDArray[np.float64]) -> GaussianResidual:
+    return GaussianResidual(problem.with_kinks(theta), variance, frequency_blocks(problem)[0])
 
 
 def laplace(likelihood: Likelihood, theta: NDArray[np.float64], prior_sd: NDArray[np.float64], coordinates: Coordinates | None = None,
