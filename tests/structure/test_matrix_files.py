@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -160,3 +162,13 @@ def test_foreign_matrices_are_refused_in_one_sentence(tmp_path: Path, name: str,
     with pytest.raises(InputError, match=words) as caught:
         read_matrices(tmp_path / name, tmp_path / name, length_unit="m", force_unit="N")
     assert "\n" not in str(caught.value) and "Traceback" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["matrix coordinate real symmetric\n% a comment\n3 3 5\n1 1 2.",
+                                  "matrix array real general\n2 2\n2.0\n9999999999999999999D\xb6?r9"])
+def test_a_file_cut_within_a_number_does_not_end_the_program(tmp_path: Path, text: str) -> None:
+    (tmp_path / "m.mtx").write_bytes(b"%%MatrixMarket " + text.encode("latin-1"))
+    program = ("import sys; from pathlib import Path; from bayes_nlsid.structure.matrix_files import read_matrix; "
+               "read_matrix(Path(sys.argv[1]), 'mass')")
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "m.mtx")], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "InputError" in done.stderr.splitlines()[-1], (done.returncode, done.stderr[-300:])

@@ -83,6 +83,7 @@ CASES = {
                                           'parameters = ["cubic[x].c"]\n[prediction]', ["[[posterior.groups]] 2", "in group 1 already"]),
     "group without scatter": ("[prediction]", '[[posterior.groups]]\nparameters = ["cubic[*].c"]\nscatter = 0\n[prediction]',
                               ["[[posterior.groups]] 1 scatter", "0"]),
+    "file with a null": ('file = "recording.npz"', 'file = "record\\u0000ing.npz"', ["file", "null character"]),
     "no structure": ("[structure] ", "[structures] ", ["[structure]", "is missing"]),
     "not TOML": ("seed = 1", "seed = = 1", ["is not valid TOML", "line 5"]),
     "own term unusable": ("[posterior]", '[[terms]]\nname = "mine"\nformula = "c*import"\nparams = { c = ["N", "coefficient"] '

@@ -120,7 +120,8 @@ def _market(data: bytes) -> Matrix:
     if rows != columns or not 0 < rows <= MAX_ROWS or 2 * entries > len(data):
         raise Unreadable(f"cannot be read as MatrixMarket (sizes {rows} × {columns} with {entries} entries do not fit the file)",
                          "check the header line and the number of entries; a matrix must be square")
-    matrix = mmread(io.BytesIO(data))
+    # scipy 1.17 reads past the end of a file that stops within a number, and the program dies of it: a line feed keeps it inside
+    matrix = mmread(io.BytesIO(data + b"\n"))
     return csr_array(matrix, dtype=float) if issparse(matrix) else np.asarray(matrix, dtype=float)
 
 

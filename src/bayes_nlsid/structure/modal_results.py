@@ -18,6 +18,7 @@ from bayes_nlsid.structure.modal import ModalModel
 
 FREQUENCY_SD, DAMPING_SD, SHAPE_SD = 1e-3, 0.1, 0.05
 """Relative standard deviations where the file gives none: what repeated modal tests of one assembly scatter by."""
+LARGEST = 1e100   # of a shape in any unit; squares stay within the range of numbers
 _FREQUENCY = {"Hz": 1.0, "kHz": 1e3, "rad/s": 1 / (2 * np.pi)}
 _RATIO = {"%": 0.01, "1": 1.0, "-": 1.0, "ratio": 1.0}
 _AXES = ("X", "Y", "Z", "RX", "RY", "RZ")
@@ -60,7 +61,7 @@ def read_modal_results(path: Path, locations: Sequence[str], sensors: Mapping[st
         if plain not in table.shapes:
             raise InputError(str(path), f"holds no shape {plain!r} (for location {location!r})",
                              f"it holds {', '.join(list(table.shapes)[:12])}")
-        if not np.isfinite(table.shapes[plain]).all():
+        if not (np.abs(table.shapes[plain]) < LARGEST).all():
             raise InputError(str(path), f"shape {plain!r} holds values that are no numbers", "export the modes again")
         columns.append(sign * table.shapes[plain])
     return _modes(path, table, tuple(wanted), np.array(columns))

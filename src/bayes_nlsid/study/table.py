@@ -210,6 +210,8 @@ class Table:
         value = self.text(key, default)
         if value is default:
             return default
+        if "\0" in value:
+            raise self.wrong(key, "holds a null character", "write the name of a file")
         path = (self.file.parent / value).resolve()
         if not path.is_file():
             raise self.wrong(key, f"there is no file {path}", "correct the name; paths are taken from the folder of the study file")
