@@ -327,6 +327,22 @@ def test_a_march_agrees_with_newton_on_the_whole_record(begun: bool) -> None:
     assert np.linalg.norm(D - E) < 6e-3 * np.linalg.norm(E) and np.linalg.norm(G - H) < 5e-2 * np.linalg.norm(H)
 
 
+def test_a_march_feels_resonances_fully_with_few_steps() -> None:
+    """A spring far from linear: between steps its force is taken as straight, of which each mode must not lose its own frequency."""
+    codes = pytest.importorskip("bayes_nlsid.forces.compiled")
+    fam = chain_family()
+    spectra = steady(fam, np.zeros(fam.size), records=2)
+    paths = bed(solve(fam, np.zeros(fam.size)), spectra, fam.places["J3_slip"][None], fam.shaker)
+    d = paths.in_time(paths.linear(1))[0].std()
+    p = np.array([0.1 * 4e5 / d ** 2])
+    law = replace(_as_law(LIBRARY["cubic"], p), code=codes.law_code(LIBRARY["cubic"]), values=p)
+    found = {m: settle(replace(paths, marched=m), 1, (law,))[0] for m in (1, 2, 32)}
+    change = np.linalg.norm(found[32] - paths.linear(1))
+    errors = [np.linalg.norm(found[m] - found[32]) / change for m in (1, 2)]
+    assert change > 0.5 * np.linalg.norm(paths.linear(1))
+    assert max(errors) < 0.003
+
+
 def test_a_hard_stop_does_not_ring() -> None:
     """A gap a hundred times stiffer than the joint it sits in: with steps too long for it the march refines them by itself."""
     codes = pytest.importorskip("bayes_nlsid.forces.compiled")
