@@ -175,14 +175,15 @@ def _beaten(bench: Bench, h: Hypothesis, others: list[Hypothesis], times: float)
 
 def _promising(bench: Bench, singles: list[Hypothesis], short: list[Candidate], most: int = 3
                ) -> tuple[list[Hypothesis], dict[tuple[str, str], float]]:
-    """All derivatives for the laws that lead and the one that promised most in the first search, where much is left: the linear model
-    that a strong law has bent comes back with them only. With the cost of those that need no more."""
+    """All derivatives for the laws that lead and the one that promised most in the first search, where these explain half and leave
+    much: the linear model that a strong law has bent comes back with them only. With the cost of those that need no more."""
     if not singles or not bench.evidence.strong or not _poor(bench, singles[0], 1.2):
         return singles, {}
-    promised = {c.effect.key: c.gain for c in short}
+    promised, values = {c.effect.key: c.gain for c in short}, bench.evidence.values
     forces = [h for h in singles if h.forces and len(h.effects) == 1]
     first = sorted(forces, key=lambda h: -promised.get(h.effects[0].key, 0.0))[:1]
-    chosen = [h for h in first + [h for h in forces if h is not first[0]][:most - 1] if not _beaten(bench, h, forces, 3.0)]
+    chosen = [h for h in first + [h for h in forces if h is not first[0]][:most - 1]
+              if not _beaten(bench, h, forces, 3.0) and h.misfit_records - values < 0.5 * (bench.evidence.chi2 - values)]
     refined = [refine(bench, h, steps=8) for h in chosen]
     return better(singles, refined), {h.effects[0].key: h.cost for h in refined}
 
