@@ -70,6 +70,36 @@ def test_a_part_of_what_was_condensed_serves_a_smaller_problem() -> None:
         regression(other, 2 * whole.weight).residual(draws(other)))
 
 
+@pytest.mark.parametrize("core", [("iwan4",), (), ("jenkins", "q|q|"), ("q|q|", "iwan4", "jenkins")])
+def test_what_problems_have_in_common_is_factored_once(core: tuple[str, ...]) -> None:
+    whole = problem("iwan4", "q|q|", "jenkins")
+    shared = condense(whole, whole.weight)
+    assert shared is not None
+    quick = shared.around(whole.with_elements([e for e in whole.model.elements if e.term.name in core]))
+    assert quick.core is not None
+    for terms in (("iwan4", "jenkins"), ("q|q|", "jenkins", "iwan4"), ("jenkins",), ()):
+        part = whole.with_elements([Element(LIBRARY[name], JOINTS) for name in terms])
+        short, plain = quick.of(part), shared.of(part)
+        assert short is not None and plain is not None
+        theta = draws(part)
+        assert np.sum(short.residual(theta)**2, axis=1) == pytest.approx(np.sum(plain.residual(theta)**2, axis=1), rel=1e-9)
+    assert shared.around(whole.with_elements([Element(LIBRARY["cubic"], JOINTS)])) is shared
+
+
+def test_parameters_that_are_known_are_held_while_starts_are_screened_and_move_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = problem("jenkins_prager", "clearance")
+    regressed = regression(one, one.weight)
+    low, high = one.to_s(one.bounds.T)
+    s = one.to_s(draws(one))
+    moving = np.arange(10) >= 6
+    assert regressed.jacobian(s, low, high, moving) == pytest.approx(regressed.jacobian(s, low, high)[..., moving], rel=1e-12)
+    known = fit(problem("jenkins_prager"), starts=4, seed=1)
+    found = fit(one, starts=12, seed=2, warm=known.values)
+    monkeypatch.setattr("bayes_nlsid.identification.fit.SURVIVORS", 12)      # all go on, so that nothing is held
+    free = fit(one, starts=12, seed=2, warm=known.values)
+    assert found.mse <= known.mse and found.mse == pytest.approx(free.mse, rel=0.02)
+
+
 @pytest.mark.parametrize("term", ["bouc_wen", "iwan5"])
 def test_laws_without_a_table_are_walked_through_the_samples(term: str) -> None:
     one = problem(term)

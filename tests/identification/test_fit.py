@@ -294,3 +294,20 @@ def test_decay_and_sweep_together_fix_what_either_leaves_open():
 
 def cubic_joint(q, v):
     return np.stack([2e8 * q[:, 0] ** 3, -1e8 * q[:, 1] ** 3], axis=-1)
+
+
+def test_a_statistic_that_is_beyond_doubt_need_not_be_worked_out():
+    """The estimate stands on the same side of its limit as the statistic, and is the statistic where that is in doubt."""
+    from bayes_nlsid.identification.select import TENFOLD, _Search
+    data = prescribed(beam(), lambda q, v: np.stack([-4e5 * q[:, 0] * np.abs(q[:, 0]), 0 * q[:, 1]], axis=-1), seconds=2.0)
+    data = replace(data, force=data.force + np.random.default_rng(0).normal(scale=0.05, size=data.force.shape))
+    bare = Problem(Model(beam()), (data,), scenario("S2", 3, 0))
+    search = _Search(bare, None, None, 1, 0, None, 1, None)
+    without = fit(bare)
+    with_it = fit(bare.with_elements([Element(LIBRARY["q|q|"], ("J1",))]))
+    variance = search.variance(with_it)
+    true = search.statistic(with_it, without, variance)
+    for limit in true * np.array([1e-9, 1e-3, 0.05, 0.5, 2.0, 1e3, 1e12]):
+        found = search.estimate(with_it, without, variance, limit)
+        assert (found > limit) == (true > limit) and (found > TENFOLD * limit) == (true > TENFOLD * limit)
+    assert search.estimate(with_it, without, variance, true) == true

@@ -7,18 +7,17 @@ sum of squares of any sub-problem. R is built up block by block; unlike the prod
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_nlsid.forces.term import Term
-from bayes_nlsid.identification.observed import SPRING, Cell, Observed, Part
+from bayes_nlsid.identification.columns import Columns, base_label, labels_of, law_labels, linear_labels, triangle_of
+from bayes_nlsid.identification.observed import Observed, Part
 from bayes_nlsid.identification.problem import Piece, Problem
 
-ROWS = 4096    # rows that join the triangle at a time, at least
 WORTH = 1.2    # entries per column from which condensing is worth it
 LARGE = 2e10   # multiplications from which unequal weights are worth the product of the columns
 STEP = 1e-6    # of the box: differences for derivatives
@@ -71,15 +70,19 @@ class Regression:
         return self.root * seen.force(piece.element.term, piece.locations, values, piece.element.excess, self.problem.places,
                                       self.problem.kink(piece))
 
-    def jacobian(self, s: Array, low: Array, high: Array) -> Array:
-        """Derivative (B, n, K) of ``forces`` by the nonlinear search coordinates of s (B, P); steps inside the box, one piece at a time."""
+    def jacobian(self, s: Array, low: Array, high: Array, moving: NDArray[np.bool_] | None = None) -> Array:
+        """Derivative (B, n, K) of ``forces`` by the nonlinear search coordinates of s (B, P), or by those ``moving`` (K,) of them; steps
+        inside the box, one piece at a time."""
         width = high - low
         free = [i for piece in self.problem.pieces for i in piece.columns]
-        out = np.zeros((len(s), len(free), self.size))
+        wanted = set(free if moving is None else np.array(free)[moving].tolist())
+        out = np.zeros((len(s), len(wanted), self.size))
         at = 0
         for i, piece in enumerate(self.problem.pieces):
-            columns = list(piece.columns)
+            columns = [k for k in piece.columns if k in wanted]
             count = len(columns)
+            if not count:
+                continue
             move = np.where(s[:, columns] + STEP * width[columns] <= high[columns], STEP, -STEP) * width[columns]
             rows = np.repeat(s[:, None], count + 1, axis=1)
             rows[:, np.arange(1, count + 1), columns] += move
@@ -130,7 +133,8 @@ class Regression:
 class Condensed:
     """Factor of all columns that some problems need, whose recordings and weights (N,) are the same.
 
-    ``labels``: first column and width of each group of columns; ``triangle`` (rows, K).
+    ``labels``: first column and width of each group of columns; ``triangle`` (rows, K). ``core``: groups that many problems have in common,
+    their orthogonal basis (rows, k) and triangle (k, k).
     """
 
     observed: Observed
@@ -138,24 +142,58 @@ class Condensed:
     labels: dict[Hashable, tuple[int, int]]
     triangle: Array = field(repr=False)
 
+    core: tuple[tuple[Hashable, ...], Array, Array] | None = field(default=None, repr=False)
+
+    def around(self, problem: Problem) -> Condensed:
+        """The same, made quick for a problem and for others that add a few columns to it."""
+        labels = labels_of(problem)
+        if any(label not in self.labels for label in labels):
+            return self
+        return replace(self, core=(labels, *np.linalg.qr(self._pick(labels))))
+
+    def _pick(self, labels: Sequence[Hashable]) -> Array:
+        spans = [self.labels[label] for label in labels]
+        return self.triangle[:, np.concatenate([np.arange(first, first + width) for first, width in spans])]
+
     def of(self, problem: Problem) -> Regression | None:
         """The regression of a problem whose columns are all here; None if some are not."""
-        wanted = [*_linear_labels(problem), _base_label(problem)]
-        laws = [_law_labels(problem, piece) for piece in problem.pieces]
-        unknown = any(label not in self.labels for labels in (wanted, *laws) for label in labels)
+        wanted, labels = [*linear_labels(problem), base_label(problem)], labels_of(problem)
+        unknown = any(label not in self.labels for label in labels)
         if unknown or problem.observed is not self.observed or _constant(problem):
             return None
-        spans = [self.labels[label] for labels in (wanted, *laws) for label in labels]
-        pick = np.concatenate([np.arange(first, first + width) for first, width in spans])
-        own = _triangle(self.triangle[:, pick]) if len(pick) < self.triangle.shape[1] else self.triangle[:, pick]
-        linear, matrices = len(wanted) - 1, []
-        at = linear + 1
-        for labels in laws:
-            width = sum(self.labels[label][1] for label in labels)
-            used = np.flatnonzero(own[:, at:at + width].any(axis=1))
-            matrices.append(np.ascontiguousarray(own[:used[-1] + 1 if len(used) else 0, at:at + width]))
-            at += width
-        return Regression(problem, own[:, :linear].copy(), own[:, linear].copy(), tuple(matrices), None)
+        own, at = self._columns(labels), 0
+        columns: dict[Hashable, Array] = {}
+        for label in self._order(labels):
+            columns[label] = own[:, at:at + self.labels[label][1]]
+            at += self.labels[label][1]
+        matrices = []
+        for piece in problem.pieces:
+            matrix = np.hstack([columns[label] for label in law_labels(problem, piece)])
+            used = np.flatnonzero(matrix.any(axis=1))
+            matrices.append(np.ascontiguousarray(matrix[:used[-1] + 1 if len(used) else 0]))
+        linear = [columns[label] for label in wanted[:-1]]
+        return Regression(problem, np.hstack(linear) if linear else np.zeros((len(own), 0)), columns[wanted[-1]][:, 0].copy(),
+                          tuple(matrices), None)
+
+    def _order(self, labels: tuple[Hashable, ...]) -> tuple[Hashable, ...]:
+        """As ``_columns`` puts them: what is in the core first, if all of the core is wanted."""
+        if self.core is None or not set(self.core[0]) <= set(labels):
+            return labels
+        return (*self.core[0], *(label for label in labels if label not in self.core[0]))
+
+    def _columns(self, labels: tuple[Hashable, ...]) -> Array:
+        """Columns of some groups with as many rows as they need."""
+        order = self._order(labels)
+        if self.core is None or order[:len(self.core[0])] != self.core[0]:
+            picked = self._pick(order)
+            return triangle_of(picked) if picked.shape[1] < self.triangle.shape[1] else picked
+        _, basis, triangle = self.core
+        if len(order) == len(self.core[0]):
+            return triangle
+        added = self._pick(order[len(self.core[0]):])
+        inside = basis.T @ added
+        rest = triangle_of(added - basis @ inside)
+        return np.block([[triangle, inside], [np.zeros((len(rest), triangle.shape[1])), rest]])
 
 
 def law_values(problem: Problem, piece: Piece, values: Array) -> Array:
@@ -214,14 +252,12 @@ def condense(problem: Problem, weights: Array) -> Condensed | None:
     """
     labels: dict[Hashable, tuple[int, int]] = {}
     at = 0
-    for label in (*_linear_labels(problem), _base_label(problem), *(x for piece in problem.pieces for x in _law_labels(problem, piece))):
-        width = label.places if isinstance(label, Part) else 1
-        if label not in labels:
-            labels[label] = (at, width)
-            at += width
+    for label in labels_of(problem):
+        labels[label] = (at, label.places if isinstance(label, Part) else 1)
+        at += labels[label][1]
     if not tabled(problem, rough=True) or problem.size < WORTH * at or _constant(problem):
         return None
-    root, source = np.sqrt(weights), _Columns(problem, labels, at)
+    root, source = np.sqrt(weights), Columns(problem, labels, at)
     if all(np.ptp(weights[cell.entries]) <= 1e-12 * np.max(weights[cell.entries]) for cell in problem.cells):
         triangle = source.factored_by_record(root)
     elif problem.size * at**2 > LARGE:
@@ -231,166 +267,11 @@ def condense(problem: Problem, weights: Array) -> Condensed | None:
     return Condensed(problem.observed, weights, labels, triangle)
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """Everything that enters a residual, cell by cell, in the order of ``labels``; ``width`` columns in all."""
-
-    problem: Problem
-    labels: dict[Hashable, tuple[int, int]]
-    width: int
-
-    def atoms(self, cell: Cell) -> dict[Hashable, list[tuple[Hashable, float, Array]]]:
-        """For each label, what it is made of in one cell: name, factor and in-band vectors (2 bins, w), which cells may share."""
-        problem, seen = self.problem, self.problem.observed
-        row = {name: seen.leverage(name)[seen.scenario.equations.index(cell.equation)] for name in self.locations}
-        out: dict[Hashable, list[tuple[Hashable, float, Array]]] = {}
-        for label, group in self.groups.items():
-            term, excess = group[0], group[2]
-            out[label] = [((label, name), row[name], seen.transformed(term, name, excess, cell.record)[:, None]) for name in group[1]]
-        for label in self.labels:
-            if isinstance(label, Part):
-                out[label] = [((label, name), row[name], tables[cell.record].matrix)
-                              for name, tables in zip(label.locations, seen.tables(label), strict=True)]
-        for label, vector in {**_own_vectors(problem, cell), _base_label(problem): problem.base[cell.entries]}.items():
-            out[label] = [((label, cell.equation), 1.0, vector[:, None])]
-        return out
-
-    @property
-    def groups(self) -> dict[Hashable, tuple[Term, tuple[str, ...], bool]]:
-        """Term, locations and excess of every linear coefficient and every stuck spring."""
-        problem = self.problem
-        out: dict[Hashable, tuple[Term, tuple[str, ...], bool]] = {}
-        parameters = problem.model.parameters
-        for i in problem.linear_index:
-            entry = parameters[i]
-            if entry.element >= 0:
-                element = problem.model.elements[entry.element]
-                out["linear", entry.name] = element.term, element.groups[entry.group], element.excess
-        return out | {x: (SPRING, x[1], False) for x in self.labels if isinstance(x, tuple) and x[0] == "stuck"}
-
-    @property
-    def locations(self) -> tuple[str, ...]:
-        """All that carry something."""
-        return tuple(dict.fromkeys(name for element in self.problem.model.elements for name in element.locations))
-
-    def block(self, cell: Cell) -> Array:
-        """Unweighted columns (2 bins, width) of one cell."""
-        out = np.zeros((2 * cell.bins, self.width))
-        for label, parts in self.atoms(cell).items():
-            first, width = self.labels[label]
-            for _, factor, vectors in parts:
-                out[:, first:first + width] += factor * vectors
-        return out
-
-    def factored(self, root: Array) -> Array:
-        """Triangle by orthogonal factors of one block of rows after the other."""
-        triangle, rows = np.zeros((0, self.width)), max(ROWS, 2 * self.width)
-        for cell in self.problem.cells:
-            block = root[cell.entries, None] * self.block(cell)
-            for i in range(0, len(block), rows):
-                triangle = _triangle(np.concatenate([triangle, block[i:i + rows]]))
-        return triangle
-
-    def product(self, root: Array) -> Array:
-        """Triangle from the eigenvectors of the product of the columns with themselves.
-
-        What equations share, the motion at the joints, is multiplied once, under the sum of their weights.
-        """
-        total = np.zeros((self.width, self.width))
-        for record in range(len(self.problem.data)):
-            cells = [cell for cell in self.problem.cells if cell.record == record]
-            weights = np.stack([root[cell.entries] ** 2 for cell in cells])
-            vectors: dict[Hashable, Array] = {}
-            factors: dict[Hashable, Array] = {}
-            place: dict[Hashable, slice] = {}
-            for c, cell in enumerate(cells):
-                for label, parts in self.atoms(cell).items():
-                    first, width = self.labels[label]
-                    for name, factor, columns in parts:
-                        vectors[name], place[name] = columns, slice(first, first + width)
-                        factors.setdefault(name, np.zeros(len(cells)))[c] += factor
-            names = list(vectors)
-            for i, one in enumerate(names):
-                for other in names[i:]:
-                    shared = factors[one] * factors[other]
-                    if shared.any():
-                        narrow, wide = sorted((one, other), key=lambda name: vectors[name].shape[1])
-                        block = ((shared @ weights)[:, None] * vectors[narrow]).T @ vectors[wide]
-                        total[place[narrow], place[wide]] += block
-                        if one != other:
-                            total[place[wide], place[narrow]] += block.T
-        norms = np.sqrt(np.diagonal(total))
-        norms = np.where(norms > 0, norms, 1.0)
-        values, eigen = np.linalg.eigh(total / np.outer(norms, norms))
-        kept = values > 1e-15 * values[-1]
-        return _triangle(np.sqrt(values[kept])[:, None] * eigen[:, kept].T * norms)
-
-    def factored_by_record(self, root: Array) -> Array:
-        """As ``factored`` where every cell has one weight: what cells share is factored once."""
-        triangle = np.zeros((0, self.width))
-        for record in range(len(self.problem.data)):
-            cells = [(cell, self.atoms(cell)) for cell in self.problem.cells if cell.record == record]
-            shared: dict[Hashable, Array] = {}
-            for _, atoms in cells:
-                shared |= {name: vectors for parts in atoms.values() for name, _, vectors in parts}
-            place, at = {}, 0
-            for name, vectors in shared.items():
-                place[name] = slice(at, at + vectors.shape[1])
-                at += vectors.shape[1]
-            common, rows = np.zeros((0, at)), max(ROWS, 2 * at)
-            for i in range(0, 2 * cells[0][0].bins, rows):
-                common = _triangle(np.concatenate([common, np.hstack([v[i:i + rows] for v in shared.values()])]))
-            for cell, atoms in cells:
-                block = np.zeros((len(common), self.width))
-                for label, parts in atoms.items():
-                    first, width = self.labels[label]
-                    for name, factor, _ in parts:
-                        block[:, first:first + width] += factor * common[:, place[name]]
-                triangle = _triangle(np.concatenate([triangle, root[cell.entries.start] * block]))
-        return triangle
-
-
-def _triangle(matrix: Array) -> Array:
-    return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=float)
-
-
-def _base_label(problem: Problem) -> Hashable:
-    """What no parameter changes depends on which parameters there are."""
-    return "base", problem.model.free_modes, problem.model.free_gain
-
-
-def _own_vectors(problem: Problem, cell: Cell) -> dict[Hashable, Array]:
-    """Columns of one cell that no other cell has: free modes, gain of the force."""
-    seen, here = problem.observed, cell.entries
-    out: dict[Hashable, Array] = {}
-    for k in problem.model.free_modes:
-        own = 1.0 if k == cell.equation else 0.0
-        out["velocity", k], out["displacement", k] = own * seen.velocity[here], own * seen.displacement[here]
-    parameters = problem.model.parameters
-    for i, column in zip(problem.linear_index, problem.columns, strict=True):
-        if parameters[i].element < 0:
-            out["linear", parameters[i].name] = column[here]
-    return out
-
-
-def _linear_labels(problem: Problem) -> list[Hashable]:
-    parameters = problem.model.parameters
-    modes: list[Hashable] = [(name, k) for k in problem.model.free_modes for name in ("velocity", "displacement")]
-    return modes + [("linear", parameters[i].name) for i in problem.linear_index]
-
-
 def _linear_vectors(problem: Problem) -> dict[Hashable, Array]:
     """Unweighted columns (N,) of everything linear, in the order of ``Regression.columns``."""
-    seen, labels = problem.observed, _linear_labels(problem)
+    seen, labels = problem.observed, linear_labels(problem)
     modes = [np.where(seen.equation == k, column, 0.0) for k in problem.model.free_modes for column in (seen.velocity, seen.displacement)]
     return dict(zip(labels, [*modes, *problem.columns], strict=True))
-
-
-def _law_labels(problem: Problem, piece: Piece) -> list[Hashable]:
-    term = piece.element.term
-    labels: list[Hashable] = list(problem.observed.parts(term, piece.locations, problem.places, True, problem.kink(piece)))
-    return [*labels, ("stuck", piece.locations)] if piece.element.excess and term.stiffness is not None else labels
 
 
 def _constant(problem: Problem) -> bool:

@@ -62,9 +62,12 @@ class Descent:
     Parameters
     ----------
     regression : Regression
+    moving : ndarray (K,) of bool or None
+        Which nonlinear entries move, the others being held; None for all.
     """
 
     regression: Regression
+    moving: NDArray[np.bool_] | None = None
     elimination: Elimination = field(init=False, repr=False)
     free: NDArray[np.intp] = field(init=False, repr=False)
     low: Array = field(init=False, repr=False)
@@ -75,6 +78,11 @@ class Descent:
         for name, value in (("elimination", Elimination(self.regression)), ("low", low), ("high", high),
                             ("free", np.array([i for piece in self.problem.pieces for i in piece.columns], dtype=np.intp))):
             object.__setattr__(self, name, value)
+
+    @property
+    def active(self) -> NDArray[np.intp]:
+        """Entries of the unit box that move."""
+        return np.arange(len(self.free)) if self.moving is None else np.flatnonzero(self.moving)
 
     @property
     def problem(self) -> Problem:
@@ -125,15 +133,17 @@ class Descent:
 
     def _step(self, points: Points) -> Points:
         """One accepted step for each, or the same point with a final status."""
-        low, width = self.low, (self.high - self.low)[self.free]
+        active = self.active
+        low, width = self.low, (self.high - self.low)[self.free[active]]
         with np.errstate(all="ignore"):
-            slope = self.regression.jacobian(self.s_of(points.x), low, self.high) * width
-        points = replace(points, evaluations=points.evaluations + 1 + len(self.free))
+            slope = self.regression.jacobian(self.s_of(points.x), low, self.high, self.moving) * width
+        points = replace(points, evaluations=points.evaluations + 1 + len(active))
         fine = np.isfinite(slope).all(axis=(1, 2))
         slope[~fine] = 0.0
         slope = self.elimination.project(slope, points.held)
         gradient, curvature = np.einsum("bnk,bn->bk", slope, points.residual), slope.transpose(0, 2, 1) @ slope
-        loose = ~(((points.x <= 0) & (gradient > 0)) | ((points.x >= 1) & (gradient < 0)))
+        at = points.x[:, active]
+        loose = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
         settled = ~(loose & (gradient != 0)).any(axis=1)
         status = np.where(~fine, "derivative not finite", np.where(settled, "converged", points.status))
         points = replace(points, status=status)
@@ -143,9 +153,11 @@ class Descent:
                 return points
             here = points.take(open_)
             move = self._move(here, gradient[open_], curvature[open_], loose[open_])
-            trial = self.at(np.clip(here.x + move, 0.0, 1.0))
+            to = here.x.copy()
+            to[:, active] = np.clip(to[:, active] + move, 0.0, 1.0)
+            trial = self.at(to)
             taken = trial.cost < here.cost
-            moved = trial.x - here.x
+            moved = (trial.x - here.x)[:, active]
             foreseen = -(2 * np.einsum("bk,bk->b", gradient[open_], moved) + np.einsum("bk,bkl,bl->b", moved, curvature[open_], moved))
             trusted = here.cost - trial.cost > 0.25 * foreseen
             damping = np.where(trusted, np.maximum(here.damping / 5, 1e-12), 2 * here.damping)

@@ -95,7 +95,8 @@ class Fit:
 
 
 def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[np.float64] | None = None,
-        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 200, shared: Condensed | None = None) -> Fit:
+        warm: Mapping[str, float] | ArrayLike | None = None, iterations: int = 200, shared: Condensed | None = None,
+        checked: bool = True, gain: float = 1e-9) -> Fit:
     """Fit all parameters of a problem.
 
     Parameters
@@ -114,6 +115,10 @@ def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[n
         Limit per start.
     shared : Condensed or None
         Columns of this and other problems under the same weights, condensed once for all (see ``condensed``).
+    checked : bool
+        Whether to walk along the recordings at the end and say in ``reasons`` if interpolating the laws has changed the mean square.
+    gain : float
+        Share of the mean square that an iteration must win; a start ends after two that do not.
 
     Returns
     -------
@@ -130,14 +135,16 @@ def fit(problem: Problem, *, starts: int = 50, seed: int = 0, weights: NDArray[n
     began = time.perf_counter()
     rough = not tabled(problem) and tabled(problem, rough=True)
     descent = Descent(regression(problem, chosen, shared, rough))
-    points = _run(descent, np.array(_first_points(descent, starts, seed, _known(problem, warm))), iterations)
+    known = _known(problem, warm)
+    first = np.array(_first_points(descent, starts, seed, known))
+    points = _run(descent, first, iterations, ~np.isfinite(known[descent.free]), gain)
     if descent.regression.root is None and rough and _blurred(problem, chosen, points):
         points = _polished(problem, chosen, points, iterations)
     used = descent.regression
     share = (time.perf_counter() - began) / len(points.cost)
     tried = tuple(Start(points.theta[i], float(points.cost[i]) / problem.samples, str(points.status[i]), int(points.evaluations[i]), share)
                   for i in range(len(points.cost)))
-    return _result(used, chosen, tried, seed)
+    return _result(used, chosen, tried, seed, checked)
 
 
 def _known(problem: Problem, warm: Mapping[str, float] | ArrayLike | None) -> NDArray[np.float64]:
@@ -165,10 +172,15 @@ def _first_points(descent: Descent, starts: int, seed: int, known: NDArray[np.fl
     return out
 
 
-def _run(descent: Descent, first: NDArray[np.float64], iterations: int) -> Points:
-    """All starts through the screening, the best of them to the end; as many side by side as fit into memory."""
+def _run(descent: Descent, first: NDArray[np.float64], iterations: int, new: NDArray[np.bool_], gain: float) -> Points:
+    """All starts through the screening, the best of them to the end; as many side by side as fit into memory.
+
+    Where some parameters are known from an earlier fit, the screening moves the others (``new``) only: it asks which start is best beside
+    what is known, and everything moves afterwards.
+    """
     side = max(1, int(SIDE_BY_SIDE // (descent.regression.size * (1 + len(descent.free)))))
-    parts = [descent.advance(descent.at(first[i:i + side]), min(SCREENING, iterations)) for i in range(0, len(first), side)]
+    screened = replace(descent, moving=new) if new.any() and not new.all() and len(first) > SURVIVORS else descent
+    parts = [_screened(screened, first[i:i + side], min(SCREENING, iterations), gain) for i in range(0, len(first), side)]
     points = parts[0]
     for part in parts[1:]:
         points = points.joined(part)
@@ -177,12 +189,21 @@ def _run(descent: Descent, first: NDArray[np.float64], iterations: int) -> Point
     ahead = np.array([i for i in order[:SURVIVORS] if points.status[i] == "running"], dtype=np.intp)
     for i in range(0, len(ahead), side):
         chosen = ahead[i:i + side]
-        points = points.put(chosen, descent.advance(points.take(chosen), max(0, iterations - SCREENING)))
+        points = points.put(chosen, descent.advance(points.take(chosen), max(0, iterations - SCREENING), gain))
     status = points.status.copy()
     left = np.setdiff1d(running, ahead)
     status[left] = "dropped after screening"
     status[ahead] = np.where(status[ahead] == "running", "iteration limit", status[ahead])
     return replace(points, status=status)
+
+
+def _screened(descent: Descent, first: NDArray[np.float64], iterations: int, gain: float) -> Points:
+    """Some iterations; what has settled while parameters were held is not there yet."""
+    points = descent.advance(descent.at(first), iterations, gain)
+    if descent.moving is None:
+        return points
+    again = np.where(points.status == "converged", "running", points.status)
+    return replace(points, status=again, quiet=np.zeros_like(points.quiet))
 
 
 def _blurred(problem: Problem, weights: NDArray[np.float64], points: Points) -> bool:
@@ -207,7 +228,7 @@ def _polished(problem: Problem, weights: NDArray[np.float64], points: Points, it
     return replace(fine, status=status).joined(replace(begun, residual=empty)) if len(others) else replace(fine, status=status)
 
 
-def _result(used: Regression, weights: NDArray[np.float64], tried: tuple[Start, ...], seed: int) -> Fit:
+def _result(used: Regression, weights: NDArray[np.float64], tried: tuple[Start, ...], seed: int, checked: bool) -> Fit:
     problem = used.problem
     best = min(tried, key=lambda x: x.mse)
     size = len(problem.names)
@@ -219,7 +240,7 @@ def _result(used: Regression, weights: NDArray[np.float64], tried: tuple[Start, 
     reasons = []
     if rank < size:
         reasons.append(f"the recordings inform {rank} of {size} directions; the others keep the width of their bounds")
-    if problem.places and tabled(problem) and problem.pieces:
+    if checked and problem.places and tabled(problem) and problem.pieces:
         exact = float(np.sum(weights * problem.exact_residual(best.theta) ** 2) / problem.samples)
         if abs(exact - best.mse) > TABLE_TOLERANCE * exact:
             reasons.append(f"interpolating the force laws between {problem.places} displacements changes the mean square from {exact:.3g} "

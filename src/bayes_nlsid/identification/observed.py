@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -154,6 +155,11 @@ class Observed:
     def samples(self) -> int:
         """Number n of samples per equation, over all recordings."""
         return sum(s.count for s in self.spectra)
+
+    @cached_property
+    def largest(self) -> NDArray[np.float64]:
+        """(N,) squares of inertia and stiffness forces, what rounding is measured by."""
+        return np.asarray(self.inertia**2 + (self.linear.omega[self.equation] ** 2 * self.displacement) ** 2)
 
     def linear_part(self, free_modes: tuple[int, ...]) -> NDArray[np.float64]:
         """(N,) a − φᵀF, with damping and stiffness of the modes that are not free."""

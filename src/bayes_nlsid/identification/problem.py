@@ -327,8 +327,7 @@ class Problem:
 
     def rounding(self, weights: NDArray[np.float64]) -> float:
         """Weighted mean square of a residual of 1e-8 of the inertia and stiffness forces: what sampling and integration leave at best."""
-        stiffness = self.model.linear.omega[self.equation] ** 2 * self.observed.displacement
-        return float(1e-16 * np.sum(weights * (self.observed.inertia**2 + stiffness**2)) / self.samples)
+        return float(1e-16 * np.sum(weights * self.observed.largest) / self.samples)
 
     # -- coordinates and variants --------------------------------------------------------------------------------------------------
 

@@ -20,6 +20,8 @@ from bayes_nlsid.model import Element
 
 Progress = Callable[[float, str], None]
 ALPHA = 1e-3   # chance that noise alone adds a term in one round, all candidates together
+GAIN = 1e-7      # share of the mean square that an iteration of a candidate must win
+TENFOLD = 10.0   # times its limit at which a statistic is beyond doubt
 KEPT = 40_000_000   # numbers in the residuals that are kept within a round
 LEAST_GAIN = 0.05   # share of the mean square that a term of moderate significance must explain
 
@@ -110,7 +112,7 @@ class _Search:
     shared: Condensed | None = None
     kept: dict[int, tuple[Fit, NDArray[np.float64]]] = field(default_factory=dict, repr=False)
 
-    def attempt(self, elements: tuple[Element, ...], warm: dict[str, float], tag: str, starts: int) -> Fit | str:
+    def attempt(self, elements: tuple[Element, ...], warm: dict[str, float], tag: str, starts: int, shared: Condensed | None) -> Fit | str:
         """Fit one set of elements, or say why it cannot be.
 
         Random starts explore what is new. Where all that is nonlinear is known from the last round, they would only repeat its search.
@@ -119,7 +121,8 @@ class _Search:
         try:
             problem = self.problem.with_elements(self.problem.model.elements + elements)
             known = all(problem.names[i] in warm for piece in problem.pieces for i in piece.columns)
-            return fit(problem, starts=1 if known else starts, seed=seed, weights=self.weights, warm=warm, shared=self.shared)
+            return fit(problem, starts=1 if known else starts, seed=seed, weights=self.weights, warm=warm, shared=shared,
+                       checked=False, gain=GAIN)
         except ValueError as error:
             return str(error)
 
@@ -127,10 +130,13 @@ class _Search:
                  done: float) -> dict[str, tuple[Fit | str, float]]:
         """Fit several sets, in any number of threads; the answer does not depend on how many."""
         names = sorted(sets)
+        # what all of them have in common is factored once
+        common = tuple(e for e in next(iter(sets.values()), ()) if all(e in elements for elements in sets.values()))
+        shared = None if self.shared is None else self.shared.around(self.problem.with_elements(self.problem.model.elements + common))
 
         def one(name: str) -> tuple[Fit | str, float]:
             began = time.perf_counter()
-            found = self.attempt(sets[name], warm, f"{tag}:{name}", starts)
+            found = self.attempt(sets[name], warm, f"{tag}:{name}", starts, shared)
             return found, time.perf_counter() - began
 
         if self.workers == 1:
@@ -168,6 +174,18 @@ class _Search:
         scale = float(np.sum(weighted * with_it.weights * variance)) / change
         drop = (without.mse - with_it.mse) * with_it.problem.samples
         return drop / scale if scale > 0 else np.inf
+
+    def estimate(self, with_it: Fit, without: Fit, variance: NDArray[np.float64], limit: float) -> float:
+        """``statistic``, from the mean noise where no other distribution of the change could bring it to the other side of its limit.
+
+        Noise along a change lies between its least and its largest value, which spares walking through the recordings.
+        """
+        noise = with_it.weights * variance
+        drop = (without.mse - with_it.mse) * with_it.problem.samples
+        least, most = float(noise.min()), float(noise.max())
+        if least > 0 and (drop <= limit * least or drop > TENFOLD * limit * most):
+            return drop / float(noise.mean())
+        return self.statistic(with_it, without, variance)
 
     def threshold(self, added: int, candidates: int) -> float:
         """Value that the statistic exceeds by noise with probability ``ALPHA`` in a round."""
@@ -285,7 +303,9 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
     # Near ties go to the smaller model, then by name, so that the order of candidates never matters.
     order = sorted(fits, key=lambda name: (float(f"{fits[name].mse:.9e}"), len(fits[name].theta), name))
     variance = search.variance(fits[order[0]]) if order else np.zeros(0)
-    values = {name: search.statistic(f, current, variance) for name, f in fits.items()}
+    # the first is told about; the others are only compared
+    values = {name: search.statistic(f, current, variance) if name == order[0] else search.estimate(f, current, variance, limits[name])
+              for name, f in fits.items()}
     for name, (f, seconds) in found.items():
         status, evaluations = (f.status, sum(s.evaluations for s in f.starts)) if isinstance(f, Fit) else (f, 0)
         tried.append(Trial(number, "add", name, f.mse if isinstance(f, Fit) else np.inf, values.get(name, 0.0), limits.get(name, np.inf),
@@ -312,7 +332,7 @@ def _judge(search: _Search, number: int, found: dict[str, tuple[Fit | str, float
 
 def _clear(statistic: float, limit: float, drop: float, mse: float) -> bool:
     """Whether a term does more than noise: above its limit, and by a twentieth of what was left or tenfold."""
-    return statistic > limit and (drop > LEAST_GAIN * mse or statistic > 10 * limit)
+    return statistic > limit and (drop > LEAST_GAIN * mse or statistic > TENFOLD * limit)
 
 
 def _smallest(search: _Search, clear: list[str], fits: dict[str, Fit], variance: NDArray[np.float64]) -> str:
