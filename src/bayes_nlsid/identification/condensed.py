@@ -125,7 +125,11 @@ class Regression:
 
     def residual(self, theta: Array) -> Array:
         """Weighted residual (B, n) of theta (B, P)."""
-        return self.base + self.linear_coefficients(theta) @ self.columns.T + self.forces(theta)
+        out = self.forces(theta)
+        out += self.base
+        if self.columns.shape[1]:
+            out += self.linear_coefficients(theta) @ self.columns.T
+        return out
 
 
 @final

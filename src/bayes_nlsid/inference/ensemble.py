@@ -2,9 +2,9 @@
 
 Moves: differential evolution 0.7, with full-length jumps between modes 0.1, snooker 0.2. They need three to four times fewer
 evaluations than the stretch move in 20 to 40 dimensions. The snooker move is our own: that of emcee 3.1.6 scales its step with the
-distance to the anchor without paying for it, and gives a Gaussian in five dimensions 0.7 of its variance. Once burn-in has shown the
-shape of the posterior, half of all proposals come from a mixture learnt from it (``proposal``). Walkers move in coordinates of their own
-(``ridges``); everything that leaves a block is in search coordinates.
+distance to the anchor without paying for it, and gives a Gaussian in five dimensions 0.7 of its variance. Half of all proposals or more
+come from a distribution learnt from the posterior itself (``proposal``). Walkers move in coordinates of their own (``ridges``);
+everything that leaves a block is in search coordinates.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from bayes_nlsid.inference.starting import centres, first_proposal, first_walker
 from bayes_nlsid.inference.target import Target
 from bayes_nlsid.inference.unvisited import with_known_optima
 
-FRESH = 0.5        # share of proposals from the mixture
+FRESH, GOOD, FAIR = 0.5, 0.7, 0.2    # share of proposals from the mixture; from one of which so many are accepted
 GAMMA = 1.7        # length of a snooker step (ter Braak and Vrugt 2008)
 KEEP_FAILED = 20   # failed points remembered per block
 ASKED = 4000       # draws on which two proposals are compared
@@ -84,7 +84,7 @@ def _fresh_class() -> type:
         """A new place drawn from a mixture that stands still, whatever the old one (Tierney 1994)."""
 
         def __init__(self, mixture: Mixture | Proposal) -> None:
-            super().__init__()
+            super().__init__(nsplits=1)    # no walker asks another: all at once
             self.mixture = mixture
 
         def get_proposal(self, s: Array, c: Sequence[Array], random: np.random.RandomState) -> tuple[Array, Array]:
@@ -100,7 +100,10 @@ def moves(mixture: Mixture | Proposal | None = None) -> list[tuple[Any, float]]:
     from emcee.moves import DEMove
 
     local = [(DEMove(), 0.7), (DEMove(gamma0=1.0), 0.1), (_snooker_class()(), 0.2)]
-    return local if mixture is None else [*((move, share * (1 - FRESH)) for move, share in local), (_fresh_class()(mixture), FRESH)]
+    if mixture is None:
+        return local
+    fresh = GOOD if isinstance(mixture, Proposal) and mixture.accepted > FAIR else FRESH
+    return [*((move, share * (1 - fresh)) for move, share in local), (_fresh_class()(mixture), fresh)]
 
 
 def run_block(target: Target, start: Walkers, steps: int, mixture: Proposal | None = None) -> Block:

@@ -72,10 +72,14 @@ class Margins:
 @final
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A mixture of bent parameters, as a density of the parameters themselves."""
+    """A mixture of bent parameters, as a density of the parameters themselves.
+
+    ``accepted``: share of its draws that an independence chain is expected to accept; 0 where nobody asked.
+    """
 
     margins: Margins
     mixture: Mixture
+    accepted: float = 0.0
 
     def log_density(self, s: Array) -> Array:
         """(n,) of s (n, P), up to a constant."""

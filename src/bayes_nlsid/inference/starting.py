@@ -3,6 +3,8 @@ the first proposal that they share."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -153,7 +155,7 @@ def first_proposal(target: Target, around: tuple[Array, Array], seed: np.random.
         log = target.along(z) - proposal.log_density(z)
         accepted = _accepted(log)
         if accepted >= highest:
-            best, highest = proposal, accepted
+            best, highest = replace(proposal, accepted=accepted), accepted
         if accepted > FINE or large == 3 or not np.isfinite(log).any():
             break
         kept = z[rng.uniform(size=len(z)) < np.exp(np.minimum(log - _level(log, wanted), 0.0))]
