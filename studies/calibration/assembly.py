@@ -75,14 +75,7 @@ def integrate(frequency: Array, zeta: Array, laws: list[truth.Static] | list[tru
         if i % FINE == 0:
             seen = a1 if disturbance is None else rate(u, v, p[2 * i], 0.5 * (disturbance[:, i] + disturbance[:, i - 1]))
             out[:, i // FINE] = seen @ out_rows
-        u2, v2 = u + 0.5 * h * v, v + 0.5 * h * a1
-        a2 = rate(u2, v2, p[2 * i + 1])
-        u3, v3 = u + 0.5 * h * v2, v + 0.5 * h * a2
-        a3 = rate(u3, v3, p[2 * i + 1])
-        u4, v4 = u + h * v3, v + h * a3
-        a4 = rate(u4, v4, p[2 * i + 2])
-        u = u + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
-        v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        u, v = truth.stepped(rate, u, v, a1, h, (p[2 * i + 1], p[2 * i + 2]))
         q = u @ rows.T
         for j, law in enumerate(laws):
             law.commit(q[:, j])

@@ -13,7 +13,6 @@ happens by chance in about one of a hundred thousand cases.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import ks_2samp
 from studies.calibration import truth
 from studies.calibration.cases import CASES, Case
-from studies.calibration.run import FOLDER
+from studies.calibration.run import stored
 
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.coordinates import Coordinates
@@ -251,8 +250,7 @@ def main() -> int:
     options = parser.parse_args()
     result = run(options.count, options.seed, lambda text: print(text, file=sys.stderr, flush=True))
     if not options.no_store:
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        (FOLDER / "hard.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        stored(result, "hard")
     print(f"{result['converged']} of {result['count']} said converged, {result['false_converged']} of them falsely")
     return 0
 

@@ -13,17 +13,15 @@ a parameter is wrong. Where nothing is hidden, false alarms are counted.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
 from studies.calibration import truth
 from studies.calibration.cases import CASES, Case
 from studies.calibration.five_joints import FiveJoints
-from studies.calibration.run import FOLDER
+from studies.calibration.run import interval, stored
 
 from bayes_nlsid.inference.adequacy import TAIL, adequacy
 from bayes_nlsid.inference.forward import forward_likelihood
@@ -145,14 +143,12 @@ def summarise(tests: list[dict[str, Any]]) -> dict[str, Any]:
     silent = [t for t in tests if not t["flagged"] and not t["refused"]]
     wrong = sum(t["worst_allowing"] > TAIL for t in silent)
     honest = n - wrong
-    interval = [float(beta.ppf(0.05, honest, n - honest + 1)) if honest else 0.0,
-                float(beta.ppf(0.95, honest + 1, n - honest)) if wrong else 1.0]
     return {"flagged": sum(t["flagged"] for t in tests), "by_innovation": sum(t["innovation"] for t in tests),
             "refused": sum(t["refused"] and not t["flagged"] for t in tests), "silently_wrong": wrong,
             "silently_wrong_given_form": sum(t["worst"] > TAIL for t in silent),
             "silently_wrong_backbone": sum(t["worst_backbone"] > TAIL for t in silent),
             "flagged_or_covered": honest / n,
-            "median_widening": np.median([t["widening"] for t in tests], axis=0).tolist(), "flagged_or_covered_90": interval,
+            "median_widening": np.median([t["widening"] for t in tests], axis=0).tolist(), "flagged_or_covered_90": interval(honest, n),
             "cover90_where_silent": float(np.mean([t["inside90"] for t in silent])) if silent else None}
 
 
@@ -177,8 +173,7 @@ def main() -> int:
     for name in options.hidden or list(TRIALS):
         result = run(TRIALS[name], options.count, options.seed)
         if not options.no_store:
-            FOLDER.mkdir(parents=True, exist_ok=True)
-            (FOLDER / f"misfit-{name.replace(' ', '-')}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+            stored(result, f"misfit-{name}")
         print(line(result), flush=True)
     return 0
 

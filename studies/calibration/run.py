@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import beta, chi2
 from studies.calibration import truth
 from studies.calibration.cases import AMPLITUDES, CASES, Case
 from studies.calibration.five_joints import FiveJoints
@@ -153,7 +153,18 @@ def line(result: dict[str, Any]) -> str:
 
 def keep(result: dict[str, Any], folder: Path = FOLDER) -> Path:
     """Store one result."""
+    return stored(result, f"{result['case']}-{result['scenario']}", folder)
+
+
+def stored(result: dict[str, Any], name: str, folder: Path = FOLDER) -> Path:
+    """Write a result of any study of calibration under a name."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{result['case']}-{result['scenario']}.json".replace(" ", "-")
+    path = folder / f"{name}.json".replace(" ", "-")
     path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return path
+
+
+def interval(hits: int, count: int) -> list[float]:
+    """Clopper–Pearson, 90 %."""
+    return [float(beta.ppf(0.05, hits, count - hits + 1)) if hits else 0.0,
+            float(beta.ppf(0.95, hits + 1, count - hits)) if hits < count else 1.0]

@@ -11,18 +11,16 @@ errors.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
 from studies.calibration import truth
 from studies.calibration.assembly import BAND
 from studies.calibration.cases import CASES
 from studies.calibration.five_joints import NAMES, FiveJoints
-from studies.calibration.run import FOLDER
+from studies.calibration.run import interval, stored
 
 from bayes_nlsid.forces.library import LIBRARY
 from bayes_nlsid.identification.fit import fit
@@ -87,12 +85,6 @@ def run(count: int, seed: int, tell: Callable[[str], None] | None = None) -> dic
             "irrelevant_preferred_90": interval(preferred, count), "irrelevant_told": sum(t["more_told"] for t in tests), "tests": tests}
 
 
-def interval(hits: int, count: int) -> list[float]:
-    """Clopper–Pearson, 90 %."""
-    return [float(beta.ppf(0.05, hits, count - hits + 1)) if hits else 0.0,
-            float(beta.ppf(0.95, hits + 1, count - hits)) if hits < count else 1.0]
-
-
 def main() -> int:
     """Run and print."""
     parser = argparse.ArgumentParser(prog="python -m studies.calibration.scenarios", description=__doc__)
@@ -102,8 +94,7 @@ def main() -> int:
     options = parser.parse_args()
     result = run(options.count, options.seed, lambda text: print(text, file=sys.stderr, flush=True))
     if not options.no_store:
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        (FOLDER / "scenarios.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        stored(result, "scenarios")
     print(f"S1 excluded in {result['s1_excluded']} of {result['count']} (beyond two standard errors in {result['s1_beyond_two_se']}); an "
           f"irrelevant term preferred by more than two standard errors in {result['irrelevant_preferred']}, told apart in "
           f"{result['irrelevant_told']}")

@@ -129,6 +129,19 @@ class Sliders:
         return 4 * density * a ** (chi + 3) / ((chi + 2) * (chi + 3))
 
 
+def stepped(rate: Callable[[Array, Array, float], Array], u: Array, v: Array, a1: Array, h: float, pushes: tuple[float, float]
+            ) -> tuple[Array, Array]:
+    """One step h of Runge and Kutta for ü = rate(u, u̇, push); ``a1``: rate at its beginning, ``pushes``: in its middle and at its end."""
+    half, last = pushes
+    u2, v2 = u + 0.5 * h * v, v + 0.5 * h * a1
+    a2 = rate(u2, v2, half)
+    u3, v3 = u + 0.5 * h * v2, v + 0.5 * h * a2
+    a3 = rate(u3, v3, half)
+    u4, v4 = u + h * v3, v + h * a3
+    a4 = rate(u4, v4, last)
+    return u + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+
 def integrate(frequency: Array, zeta: Array, law: Static | Sliders, disturbance: Array | None) -> tuple[Array, Array]:
     """Displacement and acceleration (R, n) at the rate ``FS``; ``disturbance`` (R, n · FINE), N, held over each fine step."""
     n, h = round(FS * SECONDS), 1 / (FS * FINE)
@@ -148,14 +161,7 @@ def integrate(frequency: Array, zeta: Array, law: Static | Sliders, disturbance:
             # what a sensor shows is the motion: the jump of a force held over one fine step is not part of it
             out[0, :, i // FINE] = u
             out[1, :, i // FINE] = rate(u, v, p[2 * i], 0.0 if disturbance is None else 0.5 * (disturbance[:, i] + disturbance[:, i - 1]))
-        u2, v2 = u + 0.5 * h * v, v + 0.5 * h * a1
-        a2 = rate(u2, v2, p[2 * i + 1])
-        u3, v3 = u + 0.5 * h * v2, v + 0.5 * h * a2
-        a3 = rate(u3, v3, p[2 * i + 1])
-        u4, v4 = u + h * v3, v + h * a3
-        a4 = rate(u4, v4, p[2 * i + 2])
-        u = u + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
-        v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        u, v = stepped(rate, u, v, a1, h, (p[2 * i + 1], p[2 * i + 2]))
         law.commit(u)
     return out[0], out[1]
 

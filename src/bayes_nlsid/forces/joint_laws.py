@@ -118,31 +118,24 @@ def round_stops_slope(q: Value, v: Value, k: Value, e: Value, n: Value) -> Value
 
 
 def lossy_stop(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
-    """k e y^n max(1 + sgn(k) v/u, 0) with y = max(sgn(k) q/e − 1, 0) (Hunt and Crossley, J. Appl. Mech. 42, 1975)."""
-    side = np.sign(k)
-    return k * e * np.maximum(side * q / e - 1.0, 0.0) ** n * np.maximum(1.0 + side * v / u, 0.0)
+    """``one_stop`` times max(1 + sgn(k) v/u, 0) (Hunt and Crossley, J. Appl. Mech. 42, 1975)."""
+    return one_stop(q, v, k, e, n) * np.maximum(1.0 + np.sign(k) * v / u, 0.0)
 
 
 def lossy_stop_slope(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
     """Stiffness that grows with the speed of approach, damping that grows with the pressure."""
-    side = np.sign(k)
-    y, loss = side * q / e - 1.0, np.maximum(1.0 + side * v / u, 0.0)
-    pressed = where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0)
-    return np.abs(k) * n * pressed * loss, np.abs(k) * e * pressed * np.maximum(y, 0.0) / u * where(loss > 0.0, 1.0, 0.0)
+    loss = np.maximum(1.0 + np.sign(k) * v / u, 0.0)
+    return one_stop_slope(q, v, k, e, n)[0] * loss, np.abs(one_stop(q, v, k, e, n)) / u * where(loss > 0.0, 1.0, 0.0)
 
 
 def lossy_stops(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
-    """k e s y^n max(1 + s v/u, 0) with y = max(|q|/e − 1, 0) and s = sgn(q) (Hunt and Crossley, J. Appl. Mech. 42, 1975)."""
-    side = np.sign(q)
-    return k * e * side * np.maximum(np.abs(q) / e - 1.0, 0.0) ** n * np.maximum(1.0 + side * v / u, 0.0)
+    """``lossy_stop`` on the side to which q points."""
+    return lossy_stop(q, v, k * np.sign(q), e, n, u)
 
 
 def lossy_stops_slope(q: Value, v: Value, k: Value, e: Value, n: Value, u: Value) -> Value:
-    """Stiffness that grows with the speed of approach, damping that grows with the pressure."""
-    side = np.sign(q)
-    y, loss = np.abs(q) / e - 1.0, np.maximum(1.0 + side * v / u, 0.0)
-    pressed = where(y > 0.0, np.maximum(y, 1e-12) ** (n - 1.0), 0.0)
-    return k * n * pressed * loss, k * e * pressed * np.maximum(y, 0.0) / u * where(loss > 0.0, 1.0, 0.0)
+    """That of ``lossy_stop`` on the side to which q points."""
+    return lossy_stop_slope(q, v, k * np.sign(q), e, n, u)
 
 
 def two_stops(q: Value, v: Value, k: Value, e: Value, r: Value, u: Value) -> Value:

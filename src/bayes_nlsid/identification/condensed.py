@@ -165,39 +165,31 @@ class Condensed:
         unknown = any(label not in self.labels for label in labels)
         if unknown or problem.observed is not self.observed or _constant(problem):
             return None
-        own, at = self._columns(labels), 0
-        columns: dict[Hashable, Array] = {}
-        for label in self._order(labels):
-            columns[label] = own[:, at:at + self.labels[label][1]]
-            at += self.labels[label][1]
+        columns = self._columns(labels)
         matrices = []
         for piece in problem.pieces:
             matrix = np.hstack([columns[label] for label in law_labels(problem, piece)])
             used = np.flatnonzero(matrix.any(axis=1))
             matrices.append(np.ascontiguousarray(matrix[:used[-1] + 1 if len(used) else 0]))
-        linear = [columns[label] for label in wanted[:-1]]
-        return Regression(problem, np.hstack(linear) if linear else np.zeros((len(own), 0)), columns[wanted[-1]][:, 0].copy(),
-                          tuple(matrices), None)
+        linear, base = [columns[label] for label in wanted[:-1]], columns[wanted[-1]]
+        return Regression(problem, np.hstack(linear) if linear else base[:, :0], base[:, 0].copy(), tuple(matrices), None)
 
-    def _order(self, labels: tuple[Hashable, ...]) -> tuple[Hashable, ...]:
-        """As ``_columns`` puts them: what is in the core first, if all of the core is wanted."""
+    def _columns(self, labels: tuple[Hashable, ...]) -> dict[Hashable, Array]:
+        """Columns of some groups with as many rows as they all need."""
         if self.core is None or not set(self.core[0]) <= set(labels):
-            return labels
-        return (*self.core[0], *(label for label in labels if label not in self.core[0]))
-
-    def _columns(self, labels: tuple[Hashable, ...]) -> Array:
-        """Columns of some groups with as many rows as they need."""
-        order = self._order(labels)
-        if self.core is None or order[:len(self.core[0])] != self.core[0]:
-            picked = self._pick(order)
-            return triangle_of(picked) if picked.shape[1] < self.triangle.shape[1] else picked
-        _, basis, triangle = self.core
-        if len(order) == len(self.core[0]):
-            return triangle
-        added = self._pick(order[len(self.core[0]):])
-        inside = basis.T @ added
-        rest = triangle_of(added - basis @ inside)
-        return np.block([[triangle, inside], [np.zeros((len(rest), triangle.shape[1])), rest]])
+            order, picked = labels, self._pick(labels)
+            own = triangle_of(picked) if picked.shape[1] < self.triangle.shape[1] else picked
+        else:
+            known, basis, own = self.core
+            more = tuple(label for label in labels if label not in known)
+            order = (*known, *more)
+            if more:
+                added = self._pick(more)
+                inside = basis.T @ added
+                rest = triangle_of(added - basis @ inside)
+                own = np.block([[own, inside], [np.zeros((len(rest), own.shape[1])), rest]])
+        edges = np.cumsum([self.labels[label][1] for label in order])
+        return dict(zip(order, np.split(own, edges[:-1], axis=1), strict=True))
 
 
 def law_values(problem: Problem, piece: Piece, values: Array) -> Array:

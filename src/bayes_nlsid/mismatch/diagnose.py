@@ -94,7 +94,7 @@ def analyse(case: Case, say: Progress) -> Analysis:
     fam = family(case)
     say("calibrating the linear model")
     linear = not evidence.statistic > 1.1
-    # a transfer function that a strong law has bent fits nothing well: its search does not depend on how well
+    # one that a strong law has bent is not begun from many starts, but from where the other calibrations end
     fit = calibrate(fam, spectra.s[evidence.excited], evidence.H, evidence.variance, restarts=6 if linear else 0 if evidence.strong else 2)
     as_read, between = case, heard(spectra, fam, fit, case.band)
     if between is not None and between.real:

@@ -65,6 +65,12 @@ class Effect:
         return self.cls, self.place
 
 
+def effect_of(cls: str, place: str, law: Law, values: Array) -> Effect:
+    """The effect of a law with these parameters, named as its term names them."""
+    params = law.term.params
+    return Effect(cls, place, law, values, tuple(p.name for p in params), tuple(p.unit for p in params))
+
+
 def along_period(law: Law, values: Array, d: Array, v: Array, dt: float, periodic: bool) -> Array:
     """Force (..., n) along a periodic motion (history begins at its largest displacement, so that one period is steady) or a burst."""
     if law.term.memory == "none":

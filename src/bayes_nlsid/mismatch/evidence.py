@@ -9,6 +9,7 @@ of squares, so their −2 log likelihoods add.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -62,7 +63,7 @@ class Evidence:
         """(L,)."""
         return self.spectra.excited
 
-    @property
+    @cached_property
     def chi2(self) -> float:
         """−2 log likelihood of the projected residual with nothing but noise."""
         return float(2 * np.einsum("r,ls,rls->", self.trust, self.weight, np.abs(self.residual) ** 2))
@@ -131,6 +132,12 @@ def gather(spectra: Spectra, band: tuple[float, float], mains: float = 0.0) -> E
     return Evidence(spectra, trust, weight, residual, H[excited], variance_H, statistic, odd, even, by_record)
 
 
+def transfer(F: Complex, Y: Complex, trust: Array) -> tuple[Complex, Array]:
+    """Transfer function (L, S) that fits records of force (R, L) and response (R, L, S) best, and the force's weighted power (L, 1)."""
+    power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)[:, None]
+    return np.asarray(np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power), power
+
+
 def level_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:
     """Transfer function and variance (Le, S) of the records of the lowest level, where most laws sleep; None if there is one level only."""
     spectra = evidence.spectra
@@ -139,9 +146,7 @@ def level_transfer(evidence: Evidence) -> tuple[Complex, Array] | None:
         return None
     e = evidence.excited
     low = spectra.levels < 1.01 * spectra.levels.min()
-    F, Y, trust = spectra.force[low][:, e], spectra.response[low][:, e], evidence.trust[low]
-    power = np.einsum("r,rl->l", trust, np.abs(F) ** 2)
-    H = np.einsum("r,rl,rls->ls", trust, F.conj(), Y) / power[:, None]
+    H, power = transfer(spectra.force[low][:, e], spectra.response[low][:, e], evidence.trust[low])
     noise = spectra.noise[:, e].mean(0)
     force = spectra.force_noise[:, e].mean(0)
-    return H, (noise + np.abs(H) ** 2 * force[:, None]) / power[:, None] + (0.003 * np.abs(H)) ** 2
+    return H, (noise + np.abs(H) ** 2 * force[:, None]) / power + (0.003 * np.abs(H)) ** 2

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import LinearFit
 from bayes_nlsid.mismatch.catalogue import ROWS
-from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period
+from bayes_nlsid.mismatch.effects import DELAY, GAIN, Effect, along_period, effect_of
 from bayes_nlsid.mismatch.evidence import Evidence
 from bayes_nlsid.mismatch.laws import Law, Size
 from bayes_nlsid.mismatch.linear import Family
@@ -146,8 +146,7 @@ def forced(fam: Family, fit: LinearFit, evidence: Evidence, place: str, size: Si
             force = along_period(law, values, d[:, 0], v[:, 0], paths.dt, paths.periodic)
             moved = np.linalg.norm(h * paths.to_lines(force[:, None])[spectra.lines])
             values[list(law.scaled)] *= share * np.linalg.norm(spectra.response[top]) / max(float(moved), 1e-300)
-            out.append(Candidate(Effect(row.name, place, law, values, tuple(p.name for p in law.term.params),
-                                        tuple(p.unit for p in law.term.params)), 0.0))
+            out.append(Candidate(effect_of(row.name, place, law, values), 0.0))
     return out
 
 
@@ -172,8 +171,7 @@ def _best_shape(evidence: Evidence, law: Law, shapes: Array, paths: Bed, moved: 
     best = int(np.argmax(gain))
     values = shapes[best].copy()
     values[list(law.scaled)] *= factor[best]
-    names = tuple(p.name for p in law.term.params)
-    return Candidate(Effect(cls, place, law, values, names, tuple(p.unit for p in law.term.params)), float(gain[best]))
+    return Candidate(effect_of(cls, place, law, values), float(gain[best]))
 
 
 def _regress(evidence: Evidence, columns: Complex, z: Complex, weight: Array) -> tuple[float, Array]:

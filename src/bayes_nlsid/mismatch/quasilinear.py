@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from bayes_nlsid.mismatch.calibrate import Extension, LinearFit, assemble, finish, floored
 from bayes_nlsid.mismatch.catalogue import ROWS
-from bayes_nlsid.mismatch.effects import Effect, along_period
-from bayes_nlsid.mismatch.evidence import Evidence
-from bayes_nlsid.mismatch.explain import Candidate
-from bayes_nlsid.mismatch.laws import Law, Size
+from bayes_nlsid.mismatch.effects import along_period, effect_of
+from bayes_nlsid.mismatch.evidence import Evidence, transfer
+from bayes_nlsid.mismatch.explain import Candidate, sizes
+from bayes_nlsid.mismatch.laws import Law
 from bayes_nlsid.mismatch.linear import Attachment
 from bayes_nlsid.mismatch.paths import Bed, bed
 from bayes_nlsid.mismatch.polish import Bench, Hypothesis, begin
@@ -77,8 +77,7 @@ def by_level(evidence: Evidence) -> list[Level]:
     for level in np.unique(mark):
         records = np.flatnonzero(mark == level)
         trust = evidence.trust[records]
-        power = np.einsum("r,rl->l", trust, np.abs(F[records]) ** 2)[:, None]
-        H = np.einsum("r,rl,rls->ls", trust, F[records].conj(), Y[records]) / power
+        H, power = transfer(F[records], Y[records], trust)
         noise = np.einsum("r,rls->ls", trust, spectra.noise[records][:, e]) / len(records)
         out.append((records, H, noise / power + (TOLERANCE * np.abs(H)) ** 2))
     return out
@@ -135,8 +134,11 @@ def _laws_at(bench: Bench, found: Equivalent) -> list[Hypothesis]:
     """The best law of each class that goes with the level as the place does, begun."""
     fam, spectra = bench.family, bench.evidence.spectra
     paths = bed(_linear(bench, found.theta).fields.modes, spectra, fam.places[found.place][None], fam.shaker)
-    moved = [_motion(paths, int(records[0]), k + c * paths.s) for records, (k, c) in zip(found.groups, found.values, strict=True)]
-    size, movable = _largest(moved), _own_stiffness(bench, found.place) > 0
+    motions = {int(r): paths.linear(int(r)) / (1 + paths.among[:, 0] * (k + c * paths.s)[:, None])
+               for records, (k, c) in zip(found.groups, found.values, strict=True) for r in records}
+    size = sizes(paths, [found.place], [motions[r] for r in range(len(motions))])[found.place]
+    moved = [_in_time(paths, motions[int(records[0])]) for records in found.groups]
+    movable = _own_stiffness(bench, found.place) > 0
     best: list[tuple[float, Candidate, float]] = []
     for row in ROWS.values():
         if row.kind == "force":
@@ -160,15 +162,10 @@ def _linear(bench: Bench, theta: Array) -> LinearFit:
     return finish(bench.family, theta, evidence.spectra.s[evidence.excited], evidence.H, variance, rounds=0)
 
 
-def _motion(paths: Bed, record: int, stiffness: Complex) -> tuple[Array, Array]:
-    """Displacement and velocity (n,) of the only place with this dynamic stiffness (K,) there."""
-    d, v = paths.in_time(paths.linear(record) / (1 + paths.among[:, 0] * stiffness[:, None]))
+def _in_time(paths: Bed, D: Complex) -> tuple[Array, Array]:
+    """Displacement and velocity (n,) of the only place."""
+    d, v = paths.in_time(D)
     return d[:, 0], v[:, 0]
-
-
-def _largest(moved: list[tuple[Array, Array]]) -> Size:
-    d, v = max(moved, key=lambda m: float(np.std(m[0])))
-    return Size(max(float(np.std(d)), 1e-30), max(float(np.std(v)), 1e-30), max(float(np.abs(d).max()), 1e-30))
 
 
 def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: Bed, found: Equivalent, cls: str,
@@ -194,9 +191,8 @@ def _matched(law: Law, shapes: Array, moved: list[tuple[Array, Array]], paths: B
     k = int(np.argmin(misfit))
     values = shapes[k].copy()
     values[list(law.scaled)] *= factor[k]
-    params = law.term.params
-    effect = Effect(cls, found.place, law, values, tuple(p.name for p in params), tuple(p.unit for p in params))
-    return float(misfit[k]), Candidate(effect, 0.0), float(offset @ (target - columns[:, k] * factor[k]) / length)
+    beside = float(offset @ (target - columns[:, k] * factor[k]) / length)
+    return float(misfit[k]), Candidate(effect_of(cls, found.place, law, values), 0.0), beside
 
 
 def _mirrored(candidate: Candidate) -> Candidate:
